@@ -1,3 +1,9 @@
 from pathlib import Path
 
-import sb3_chdp.envs
+import sb3_chdp.envs  # registers the environments
+from sb3_chdp.chdp import CHDP
+from sb3_chdp.common.spaces import HybridActionSpec
+
+__version__ = Path(__file__).with_name("version.txt").read_text().strip()
+
+__all__ = ["CHDP", "HybridActionSpec"]

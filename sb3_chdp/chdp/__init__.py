@@ -1,0 +1,4 @@
+from sb3_chdp.chdp.chdp import CHDP
+from sb3_chdp.chdp.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+
+__all__ = ["CHDP", "CnnPolicy", "MlpPolicy", "MultiInputPolicy"]

@@ -1,0 +1,420 @@
+"""Cooperative Hybrid Diffusion Policies."""
+
+from typing import Any, ClassVar, TypeVar
+
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, update_learning_rate
+from torch.nn import functional as F
+
+from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, CooperativeActor, MlpPolicy, MultiInputPolicy
+from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
+from sb3_chdp.common.policies import HybridCritic
+from sb3_chdp.common.type_aliases import HybridReplaySamples
+from sb3_chdp.common.utils import polyak_update
+
+SelfCHDP = TypeVar("SelfCHDP", bound="CHDP")
+
+IMPROVEMENT_QS = ("q1", "min", "mean")
+
+
+class CHDP(HybridOffPolicyAlgorithm):
+    """
+    Cooperative Hybrid Diffusion Policies (CHDP)
+
+    A discrete and a continuous diffusion policy act in turn: the first draws a latent that a codebook decodes to the
+    discrete action, the second draws the parameters given that action's codeword. They are improved in turn as well, by
+    back-propagation of a twin critic through their denoising chains.
+
+    Paper: Liu et al., "CHDP: Cooperative Hybrid Diffusion Policies for Reinforcement Learning in Parameterized Action
+    Space", AAAI 2026. No reference code is published.
+
+    Differences from the paper, all of them arguments:
+        1. the action of highest Q among ``n_action_candidates`` draws acts (1: the paper);
+        2. uniformly random actions with a decreasing probability, see ``exploration_initial_eps`` (0: the paper);
+        3. latents from the buffer that no longer decode to the action taken are replaced, see ``relabel_latents``;
+        4. gradient norms are clipped, see ``max_grad_norm``.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
+    :param env: The environment to learn from (if registered in Gym, can be str), with a hybrid action space
+    :param learning_rate: learning rate for adam optimizer, the same for all networks;
+        it can be a function of the current progress remaining (from 1 to 0)
+    :param buffer_size: size of the replay buffer
+    :param learning_starts: how many steps of the model to collect transitions for before learning starts
+    :param batch_size: Minibatch size for each gradient update
+    :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
+    :param gamma: the discount factor
+    :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
+        like ``(5, "step")`` or ``(2, "episode")``.
+    :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``)
+        Set to ``-1`` means to do as many gradient steps as steps done in the environment during the rollout.
+    :param action_noise: noise on the scaled parameters, of size Pmax (None by default: the policies are stochastic)
+    :param replay_buffer_class: Replay buffer class to use. If ``None``, it will be automatically selected.
+    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
+    :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer at a cost of more complexity.
+    :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the critics.
+    :param latent_dim: width d_e of the latent and of a codeword
+    :param n_diffusion_steps: number N of denoising steps of both policies
+    :param beta_schedule: noise schedule, "vp", "linear" or "cosine"
+    :param variance_type: variance of a denoising step, "fixed_large" (the paper) or "fixed_small" (DDPM's posterior)
+    :param eta: weight of the policy improvement terms relative to the diffusion losses
+    :param improvement_q: which Q the policies ascend: "q1", "min" or "mean" of the two
+    :param n_action_candidates: number of actions drawn per observation when acting; the one with the highest min(Q1, Q2)
+        of the target critics is taken
+    :param relabel_latents: whether a stored latent that does not decode to the stored discrete action any more is
+        replaced by that action's present codeword
+    :param codebook_learning_rate: learning rate of the codebook, None for ``learning_rate``
+    :param max_grad_norm: bound on the gradient norm of every network, None for none
+    :param policy_delay: policies and targets are updated once every ``policy_delay`` critic updates
+    :param diffusion: False replaces both diffusion policies by deterministic MLPs (ablation)
+    :param codebook: False replaces the codebook by argmax over a latent of width K and one-hot vectors (ablation)
+    :param sequential_update: False updates the continuous policy on the stored latents and actions instead of those of
+        the updated discrete policy (ablation)
+    :param exploration_noise: standard deviation of the exploration noise if ``diffusion`` is False
+    :param action_layout: how to read an ambiguous action space, "auto", "per_action" or "shared",
+        see :class:`HybridActionSpec`
+    :param exploration_fraction: fraction of the training over which the rate of uniformly random actions is reduced
+    :param exploration_initial_eps: initial probability of a uniformly random action
+    :param exploration_final_eps: final probability of a uniformly random action
+    :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
+        the reported success rate, mean episode length, and mean reward over
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param policy_kwargs: additional arguments to be passed to the policy on creation, see :class:`CHDPPolicy`
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for
+        debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run.
+        Setting it to auto, the code will be run on the GPU if possible.
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    policy: CHDPPolicy
+    actor: CooperativeActor
+    actor_target: CooperativeActor
+    critic: HybridCritic
+    critic_target: HybridCritic
+
+    def __init__(
+        self,
+        policy: str | type[CHDPPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 1e-3,
+        buffer_size: int = 1_000_000,  # 1e6
+        learning_starts: int = 500,
+        batch_size: int = 128,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        latent_dim: int = 8,
+        n_diffusion_steps: int = 15,
+        beta_schedule: str = "vp",
+        variance_type: str = "fixed_large",
+        eta: float = 10.0,
+        improvement_q: str = "q1",
+        n_action_candidates: int = 16,
+        relabel_latents: bool = True,
+        codebook_learning_rate: float | Schedule | None = None,
+        max_grad_norm: float | None = 1.0,
+        policy_delay: int = 1,
+        diffusion: bool = True,
+        codebook: bool = True,
+        sequential_update: bool = True,
+        exploration_noise: float = 0.1,
+        action_layout: str = "auto",
+        exploration_fraction: float = 0.2,
+        exploration_initial_eps: float = 1.0,
+        exploration_final_eps: float = 0.05,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            action_layout=action_layout,
+            exploration_fraction=exploration_fraction,
+            exploration_initial_eps=exploration_initial_eps,
+            exploration_final_eps=exploration_final_eps,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+        )
+        if improvement_q not in IMPROVEMENT_QS:
+            raise ValueError(f"improvement_q must be one of {IMPROVEMENT_QS}, got {improvement_q!r}")
+        for name, value in (
+            ("latent_dim", latent_dim), ("n_action_candidates", n_action_candidates), ("policy_delay", policy_delay)
+        ):
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        self.latent_dim = latent_dim
+        self.n_diffusion_steps = n_diffusion_steps
+        self.beta_schedule = beta_schedule
+        self.variance_type = variance_type
+        self.eta = eta
+        self.improvement_q = improvement_q
+        self.n_action_candidates = n_action_candidates
+        self.relabel_latents = relabel_latents
+        self.codebook_learning_rate = codebook_learning_rate
+        self.max_grad_norm = max_grad_norm
+        self.policy_delay = policy_delay
+        self.diffusion = diffusion
+        self.codebook = codebook
+        self.sequential_update = sequential_update
+        self.exploration_noise = exploration_noise
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _network_kwargs(self) -> dict[str, Any]:
+        return dict(
+            diffusion=self.diffusion,
+            codebook=self.codebook,
+            n_diffusion_steps=self.n_diffusion_steps,
+            beta_schedule=self.beta_schedule,
+            variance_type=self.variance_type,
+            n_action_candidates=self.n_action_candidates,
+            exploration_noise=self.exploration_noise,
+        )
+
+    def _latent_dim(self, n_discrete_actions: int) -> int:
+        return self.latent_dim if self.codebook else n_discrete_actions
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self._create_aliases()
+        rate = self.learning_rate if self.codebook_learning_rate is None else self.codebook_learning_rate
+        self.codebook_lr_schedule = FloatSchedule(rate)
+        online, target = (self.actor, self.critic), (self.actor_target, self.critic_target)
+        # The features extractor may be shared: a dict counts it once
+        self._online_params = list(dict.fromkeys(p for net in online for p in net.parameters()))
+        self._target_params = list(dict.fromkeys(p for net in target for p in net.parameters()))
+        # Running mean and running var
+        self._batch_norm_stats = [stat for net in online for stat in get_parameters_by_name(net, ["running_"])]
+        self._batch_norm_stats_target = [stat for net in target for stat in get_parameters_by_name(net, ["running_"])]
+
+    def _create_aliases(self) -> None:
+        self.actor = self.policy.actor
+        self.actor_target = self.policy.actor_target
+        self.critic = self.policy.critic
+        self.critic_target = self.policy.critic_target
+
+    def train(self, gradient_steps: int, batch_size: int = 128) -> None:
+        # Switch to train mode (this affects batch norm / dropout)
+        self.policy.set_training_mode(True)
+        policy = self.policy
+        self._update_learning_rates()
+
+        logs: dict[str, list[th.Tensor]] = {}
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            replay_data, drift = self._relabel(self._sample_batch(batch_size))
+
+            # Step 0: critics
+            critic_loss, q_values = self._critic_loss(replay_data)
+            self._optimize(critic_loss, policy.critic.optimizer)
+            losses = {"critic_loss": critic_loss, "q_mean": q_values.mean(), "latent_drift": drift}
+
+            if self._n_updates % self.policy_delay == 0:
+                # alpha of eq. dql_q_loss
+                alpha = self.eta / q_values.abs().mean().clamp(min=1e-6)
+                actor_features = policy.actor_features(replay_data.observations)
+                with th.no_grad():
+                    critic_features = self.critic.features(replay_data.observations)
+
+                # Step 1: discrete policy
+                diffusion_loss, q_loss = self._discrete_policy_loss(replay_data, actor_features, critic_features)
+                discrete_loss = diffusion_loss + alpha * q_loss
+                self._optimize(discrete_loss, policy.discrete_optimizer)
+                losses |= {"discrete_loss": discrete_loss, "diffusion_loss_discrete": diffusion_loss}
+
+                # Step 2: continuous policy and codebook, given the updated discrete policy
+                diffusion_loss, q_loss, k = self._continuous_policy_loss(replay_data, actor_features, critic_features)
+                continuous_loss = diffusion_loss + alpha * q_loss
+                self._optimize(continuous_loss, policy.continuous_optimizer, policy.codebook_optimizer)
+                losses |= {"continuous_loss": continuous_loss, "diffusion_loss_continuous": diffusion_loss}
+
+                polyak_update(self._online_params, self._target_params, self.tau)
+                # Copy running stats, see SB3's GH issue #996
+                if self._batch_norm_stats:
+                    polyak_update(self._batch_norm_stats, self._batch_norm_stats_target, 1.0)
+            for name, value in losses.items():
+                logs.setdefault(name, []).append(value.detach())
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, values in logs.items():
+            self.logger.record(f"train/{name}", th.stack(values).mean().item())
+        if "continuous_loss" in logs:
+            self._log_codebook_usage(k)
+
+    def _update_learning_rates(self) -> None:
+        """Set the learning rates of all optimizers according to their schedules."""
+        policy = self.policy
+        self._update_learning_rate([policy.critic.optimizer, policy.discrete_optimizer, policy.continuous_optimizer])
+        if policy.codebook_optimizer is not None:
+            rate = self.codebook_lr_schedule(self._current_progress_remaining)
+            update_learning_rate(policy.codebook_optimizer, rate)
+            self.logger.record("train/codebook_learning_rate", rate)
+
+    def _relabel(self, replay_data: HybridReplaySamples) -> tuple[HybridReplaySamples, th.Tensor]:
+        """
+        Replace latents that the codebook has moved away from.
+
+        :return: the batch, and the share of its latents that do not decode to the stored action
+        """
+        codebook = self.actor.codebook
+        drifted = codebook.quantize(replay_data.latents) != replay_data.discrete_actions
+        if self.relabel_latents:
+            present = codebook.representative_latents(replay_data.discrete_actions)
+            replay_data = replay_data._replace(latents=th.where(drifted[:, None], present, replay_data.latents))
+        return replay_data, drifted.float().mean()
+
+    def _critic_loss(self, replay_data: HybridReplaySamples) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Mean squared Bellman errors (eq. CHDP_critic_loss_overview).
+
+        :return: their sum over both critics, and the detached (B, 1) values of the first
+        """
+        with th.no_grad():
+            # Next action of the target policies
+            next_features = self.actor_target.features(replay_data.next_observations)
+            next_latents, _, next_parameters = self.actor_target.sample(next_features)
+            # Compute the next Q-values: min over both target critics
+            next_critic_features = self.critic_target.features(replay_data.next_observations)
+            next_q_values = th.min(*self.critic_target.q_values(next_critic_features, next_latents, next_parameters))
+            target_q_values = replay_data.rewards + (1 - replay_data.dones) * replay_data.discounts * next_q_values
+        features = self.critic.features(replay_data.observations)
+        q1, q2 = self.critic.q_values(features, replay_data.latents, replay_data.parameters)
+        return F.mse_loss(q1, target_q_values) + F.mse_loss(q2, target_q_values), q1.detach()
+
+    def _discrete_policy_loss(
+        self, replay_data: HybridReplaySamples, actor_features: th.Tensor, critic_features: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Eq. discrete_policy_loss_chdp_final: Q of latents drawn through the whole chain, with the stored parameters.
+
+        :return: diffusion loss and policy improvement loss
+        """
+        policy = self.actor.discrete_policy
+        diffusion_loss = policy.diffusion_loss(replay_data.latents, actor_features)
+        latents = policy.sample(actor_features)
+        q_loss = -self._improvement_q(critic_features, latents, replay_data.parameters).mean()
+        return diffusion_loss, q_loss
+
+    def _continuous_policy_loss(
+        self, replay_data: HybridReplaySamples, actor_features: th.Tensor, critic_features: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """
+        Eq. continuous_policy_loss_chdp_final: Q of parameters drawn through the whole chain, given latents of the updated
+        discrete policy; the gradient reaches the codebook through the condition of the chain.
+
+        :return: diffusion loss, policy improvement loss, and the (B,) discrete actions
+        """
+        actor = self.actor
+        # The features extractor belongs to the discrete policy
+        actor_features = actor_features.detach()
+        stored_k = replay_data.discrete_actions
+        condition = th.cat([actor_features, actor.codebook(stored_k).detach()], dim=1)
+        diffusion_loss = actor.continuous_policy.diffusion_loss(replay_data.parameters, condition, actor.mask(stored_k))
+
+        if self.sequential_update:
+            with th.no_grad():
+                latents = actor.discrete_policy.sample(actor_features)
+                k = actor.codebook.quantize(latents)
+        else:
+            latents, k = replay_data.latents, stored_k
+        parameters = actor.sample_parameters(actor_features, k)
+        q_loss = -self._improvement_q(critic_features, latents, parameters).mean()
+        return diffusion_loss, q_loss, k
+
+    def _improvement_q(self, critic_features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+        """:return: (B, 1) the Q that the policies ascend; gradient flows to the action only"""
+        if self.improvement_q == "q1":
+            return self.critic.q_networks[0](th.cat([critic_features, latents, parameters], dim=1))
+        q1, q2 = self.critic.q_values(critic_features, latents, parameters)
+        return th.min(q1, q2) if self.improvement_q == "min" else 0.5 * (q1 + q2)
+
+    def _optimize(self, loss: th.Tensor, *optimizers: th.optim.Optimizer | None) -> None:
+        """One gradient step of the parameters of the given optimizers, and of no others."""
+        used = [optimizer for optimizer in optimizers if optimizer is not None]
+        groups = [[p for group in optimizer.param_groups for p in group["params"]] for optimizer in used]
+        params = [p for group in groups for p in group]
+        for p, gradient in zip(params, th.autograd.grad(loss, params), strict=True):
+            p.grad = gradient
+        for optimizer, group in zip(used, groups, strict=True):
+            if self.max_grad_norm is not None:
+                th.nn.utils.clip_grad_norm_(group, self.max_grad_norm)
+            optimizer.step()
+
+    def _log_codebook_usage(self, k: th.Tensor) -> None:
+        """
+        Log how many actions the discrete policy uses in a batch.
+
+        :param k: (B,) discrete actions
+        """
+        frequencies = th.unique(k, return_counts=True)[1] / len(k)
+        perplexity = (-(frequencies * frequencies.log()).sum()).exp()
+        self.logger.record("train/codebook_usage", len(frequencies) / self.hybrid_space.spec.n_discrete_actions)
+        self.logger.record("train/codebook_perplexity", perplexity.item())
+
+    def learn(
+        self: SelfCHDP,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "CHDP",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfCHDP:
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+    def _excluded_save_params(self) -> list[str]:
+        networks = ["actor", "critic", "actor_target", "critic_target"]
+        caches = ["_online_params", "_target_params", "_batch_norm_stats", "_batch_norm_stats_target"]
+        return [*super()._excluded_save_params(), *networks, *caches]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts = ["policy", "critic.optimizer", "policy.discrete_optimizer", "policy.continuous_optimizer"]
+        if self.codebook:
+            state_dicts.append("policy.codebook_optimizer")
+        return state_dicts, []

@@ -1,0 +1,63 @@
+"""Vector quantisation of the discrete policy's latent into a discrete action."""
+
+import torch as th
+from torch import nn
+from torch.nn import functional as F
+
+
+class Codebook(nn.Module):
+    """
+    Learnable codewords, one per discrete action (the paper's E_zeta), initialised U(-1, 1).
+
+    :param n_discrete_actions: number K of codewords
+    :param latent_dim: width d_e of a codeword
+    """
+
+    def __init__(self, n_discrete_actions: int, latent_dim: int):
+        super().__init__()
+        self.n_discrete_actions, self.latent_dim = n_discrete_actions, latent_dim
+        self.codewords = nn.Parameter(th.empty(n_discrete_actions, latent_dim).uniform_(-1, 1))
+
+    def quantize(self, latents: th.Tensor) -> th.Tensor:
+        """
+        :param latents: (B, d_e)
+        :return: (B,) index k of the nearest codeword in squared Euclidean distance
+        """
+        codewords = self.codewords.detach()
+        # |e - c|^2 without |e|^2, which is the same for all codewords
+        return th.addmm(codewords.square().sum(dim=1), latents.detach(), codewords.t(), alpha=-2).argmin(dim=1)
+
+    def forward(self, k: th.Tensor) -> th.Tensor:
+        """
+        :param k: (B,) discrete actions
+        :return: (B, d_e) their codewords e_k, with gradient
+        """
+        return self.codewords[k]
+
+    def representative_latents(self, k: th.Tensor) -> th.Tensor:
+        """:return: (B, d_e) latents in [-1, 1] that stand for the discrete actions"""
+        return self.codewords.detach()[k].clamp(-1, 1)
+
+
+class OneHotCodebook(nn.Module):
+    """
+    The ablation "without codebook": latents of width K, decoded by argmax and represented by one-hot vectors.
+
+    :param n_discrete_actions: number K of discrete actions
+    """
+
+    def __init__(self, n_discrete_actions: int):
+        super().__init__()
+        self.n_discrete_actions = self.latent_dim = n_discrete_actions
+
+    def quantize(self, latents: th.Tensor) -> th.Tensor:
+        """See :meth:`Codebook.quantize`."""
+        return latents.argmax(dim=1)
+
+    def forward(self, k: th.Tensor) -> th.Tensor:
+        """:return: (B, K) one-hot vectors"""
+        return F.one_hot(k, self.n_discrete_actions).float()
+
+    def representative_latents(self, k: th.Tensor) -> th.Tensor:
+        """:return: (B, K) vectors of 1 at k and -1 elsewhere"""
+        return 2 * self(k) - 1

@@ -1,0 +1,353 @@
+"""Networks of CHDP: a discrete and a continuous diffusion policy, their codebook, the twin critic and all targets."""
+
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.torch_layers import (
+    BaseFeaturesExtractor,
+    CombinedExtractor,
+    FlattenExtractor,
+    NatureCNN,
+    get_actor_critic_arch,
+)
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+
+from sb3_chdp.chdp.codebook import Codebook, OneHotCodebook
+from sb3_chdp.chdp.diffusion import DeterministicModel, DiffusionModel
+from sb3_chdp.common.policies import HybridCritic, HybridPolicy
+from sb3_chdp.common.spaces import HybridActionSpec, HybridBox
+
+# Spread of the latents around a codeword in random actions
+RANDOM_LATENT_NOISE = 0.1
+
+
+class CooperativeActor(BaseModel):
+    """
+    The two agents of the cooperative game.
+
+    The discrete policy draws a latent e, the codebook decodes it to k and e_k, and the continuous policy, conditioned on
+    the state and e_k, draws the parameters.
+
+    :param observation_space: observation space
+    :param action_space: space of the action rows
+    :param features_extractor: network to extract features, the same for both agents
+    :param features_dim: number of features
+    :param codebook: quantises the latents
+    :param discrete_policy: model of the latents given the features
+    :param continuous_policy: model of the parameters given the features and a codeword
+    :param normalize_images: whether to divide images by 255
+    """
+
+    parameter_mask: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: HybridBox,
+        features_extractor: BaseFeaturesExtractor,
+        codebook: Codebook | OneHotCodebook,
+        discrete_policy: DiffusionModel | DeterministicModel,
+        continuous_policy: DiffusionModel | DeterministicModel,
+        normalize_images: bool = True,
+    ):
+        super().__init__(
+            observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
+        )
+        self.codebook = codebook
+        self.discrete_policy = discrete_policy
+        self.continuous_policy = continuous_policy
+        mask = action_space.spec.mask
+        self._has_padding = not bool(mask.all())
+        # Not needed when no action has padding, and then not kept: K may be 65,536
+        self.register_buffer("parameter_mask", th.tensor(mask if self._has_padding else mask[:1], dtype=th.float32), persistent=False)
+
+    def features(self, obs: PyTorchObs) -> th.Tensor:
+        """:return: (B, features_dim) features of the observations"""
+        return self.extract_features(obs, self.features_extractor)
+
+    def mask(self, k: th.Tensor) -> th.Tensor | None:
+        """:return: (B, Pmax) 1 for the parameters that action k has, None if no action has padding"""
+        return self.parameter_mask[k] if self._has_padding else None
+
+    def sample_parameters(
+        self, features: th.Tensor, k: th.Tensor, initial_noise: th.Tensor | None = None, deterministic: bool = False
+    ) -> th.Tensor:
+        """
+        :param features: (B, features_dim)
+        :param k: (B,) discrete actions
+        :param initial_noise: (B, Pmax) start of the chain, drawn if None
+        :param deterministic: whether to inject no noise on the way
+        :return: (B, Pmax) parameters in [-1, 1], padding 0; their gradient reaches the codewords of k
+        """
+        condition = th.cat([features, self.codebook(k)], dim=1)
+        return self.continuous_policy.sample(condition, initial_noise, self.mask(k), deterministic)
+
+    def sample(
+        self,
+        features: th.Tensor,
+        initial_noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None),
+        deterministic: bool = False,
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """
+        :param features: (B, features_dim)
+        :param initial_noise: starts of the two chains, drawn if None
+        :param deterministic: whether to inject no noise on the way
+        :return: latents (B, latent_dim), discrete actions (B,), parameters (B, Pmax)
+        """
+        latents = self.discrete_policy.sample(features, initial_noise[0], deterministic=deterministic)
+        k = self.codebook.quantize(latents)
+        return latents, k, self.sample_parameters(features, k, initial_noise[1], deterministic)
+
+
+class CHDPPolicy(HybridPolicy):
+    """
+    Policy class (with both agents, their codebook and the critics) for CHDP.
+
+    The arguments from ``latent_dim`` on are set by the arguments of the same name of :class:`CHDP`.
+
+    :param observation_space: observation space
+    :param action_space: space of the action rows, with ``latent_dim`` latent columns
+    :param lr_schedule: learning rate schedule
+    :param net_arch: hidden layers, one list for all networks or ``dict(pi=..., qf=...)`` for the noise predictors and
+        the critics; by default ``dict(pi=[128, 128], qf=[256, 256])``, for images no hidden layer before the features
+    :param activation_fn: activation function
+    :param features_extractor_class: features extractor to use
+    :param features_extractor_kwargs: its keyword arguments
+    :param normalize_images: whether to divide images by 255
+    :param optimizer_class: optimizer of all networks
+    :param optimizer_kwargs: its keyword arguments, without the learning rate
+    :param share_features_extractor: whether both agents use the critic's features extractor, which then learns from the
+        critic's loss alone; otherwise they have their own, which learns from the loss of the discrete policy
+    :param diffusion: whether the policies are diffusion models (False: deterministic MLPs)
+    :param codebook: whether discrete actions are represented by codewords (False: one-hot vectors)
+    :param n_diffusion_steps: number N of denoising steps
+    :param beta_schedule: see :class:`NoiseSchedule`
+    :param variance_type: see :class:`NoiseSchedule`
+    :param n_action_candidates: number of actions drawn per observation, of which the one with the highest min(Q1, Q2) of
+        the target critics acts
+    :param exploration_noise: standard deviation of the exploration noise of policies without diffusion
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: HybridBox,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.SiLU,
+        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        share_features_extractor: bool = False,
+        diffusion: bool = True,
+        codebook: bool = True,
+        n_diffusion_steps: int = 15,
+        beta_schedule: str = "vp",
+        variance_type: str = "fixed_large",
+        n_action_candidates: int = 16,
+        exploration_noise: float = 0.1,
+    ):
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor_class,
+            features_extractor_kwargs,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            normalize_images=normalize_images,
+            squash_output=True,
+        )
+        self.net_arch = {"pi": [128, 128], "qf": [256, 256]} if net_arch is None else net_arch
+        self.activation_fn = activation_fn
+        self.share_features_extractor = share_features_extractor
+        self.diffusion = diffusion
+        self.use_codebook = codebook
+        self.n_diffusion_steps = n_diffusion_steps
+        self.beta_schedule = beta_schedule
+        self.variance_type = variance_type
+        self.n_action_candidates = n_action_candidates
+        self.exploration_noise = exploration_noise
+        self._build(lr_schedule)
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        spec: HybridActionSpec = self.action_space.spec
+        latent_dim = self.action_space.latent_dim
+        actor_arch, critic_arch = get_actor_critic_arch(self.net_arch)
+
+        critic_extractor = self.make_features_extractor()
+        features_dim = critic_extractor.features_dim
+        self.critic = HybridCritic(
+            self.observation_space,
+            latent_dim + spec.max_parameters,
+            critic_arch,
+            critic_extractor,
+            features_dim,
+            self.activation_fn,
+            self.normalize_images,
+        )
+        k_total = spec.n_discrete_actions
+        codebook = Codebook(k_total, latent_dim) if self.use_codebook else OneHotCodebook(k_total)
+        self.actor = CooperativeActor(
+            self.observation_space,
+            self.action_space,
+            critic_extractor if self.share_features_extractor else self.make_features_extractor(),
+            codebook,
+            self._make_model(latent_dim, features_dim, actor_arch),
+            self._make_model(spec.max_parameters, features_dim + latent_dim, actor_arch),
+            self.normalize_images,
+        )
+        # Copied together: a shared features extractor stays shared among the targets
+        self.actor_target, self.critic_target = deepcopy((self.actor, self.critic))
+        for target in (self.actor_target, self.critic_target):
+            target.requires_grad_(False)
+            target.set_training_mode(False)
+
+        discrete_parameters = list(self.actor.discrete_policy.parameters())
+        if not self.share_features_extractor:
+            discrete_parameters += list(self.actor.features_extractor.parameters())
+        self.discrete_optimizer = self._make_optimizer(discrete_parameters, lr_schedule)
+        self.continuous_optimizer = self._make_optimizer(list(self.actor.continuous_policy.parameters()), lr_schedule)
+        self.critic.optimizer = self._make_optimizer(list(self.critic.parameters()), lr_schedule)
+        self.codebook_optimizer: th.optim.Optimizer | None = None
+        if self.use_codebook:
+            self.codebook_optimizer = self._make_optimizer(list(codebook.parameters()), lr_schedule)
+
+        # Starts of the chains of deterministic predictions, the same for every observation and every model
+        generator = th.Generator().manual_seed(0)
+        for name, dim in (("latent_noise", latent_dim), ("parameter_noise", spec.max_parameters)):
+            noise = th.randn((self.n_action_candidates, dim), generator=generator)
+            self.register_buffer(f"deterministic_{name}", noise, persistent=False)
+
+    def _make_model(self, dim: int, condition_dim: int, net_arch: list[int]) -> DiffusionModel | DeterministicModel:
+        if not self.diffusion:
+            return DeterministicModel(dim, condition_dim, net_arch, self.activation_fn, self.exploration_noise)
+        return DiffusionModel(
+            dim,
+            condition_dim,
+            self.n_diffusion_steps,
+            net_arch,
+            self.activation_fn,
+            self.beta_schedule,
+            self.variance_type,
+        )
+
+    def _make_optimizer(self, parameters: list[th.Tensor], lr_schedule: Schedule) -> th.optim.Optimizer:
+        return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+    def actor_features(self, obs: PyTorchObs) -> th.Tensor:
+        """:return: (B, features_dim) features of both agents, without gradient if the critic owns the extractor"""
+        features = self.actor.features(obs)
+        return features.detach() if self.share_features_extractor else features
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self._predict(obs, deterministic)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """
+        Draw ``n_action_candidates`` actions per observation and keep the one of highest target min(Q1, Q2).
+
+        :return: (B, 1 + Pmax + latent_dim) rows
+        """
+        n_candidates = self.n_action_candidates
+        features = self.actor_features(observation)
+        batch_size = features.shape[0]
+        initial_noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None)
+        if deterministic:
+            starts = (self.deterministic_latent_noise, self.deterministic_parameter_noise)
+            initial_noise = tuple(start.repeat(batch_size, 1) for start in starts)  # type: ignore[assignment]
+        features = features.repeat_interleave(n_candidates, dim=0)
+        latents, k, parameters = self.actor.sample(features, initial_noise, deterministic)
+        rows = th.cat([k[:, None].float(), parameters, latents], dim=1)
+        if n_candidates == 1:
+            return rows
+        critic_features = self.critic_target.features(observation).repeat_interleave(n_candidates, dim=0)
+        q_values = th.min(*self.critic_target.q_values(critic_features, latents, parameters))
+        best = q_values.view(batch_size, n_candidates).argmax(dim=1)
+        return rows.view(batch_size, n_candidates, -1)[th.arange(batch_size, device=best.device), best]
+
+    def random_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Uniformly random actions; their latents scatter around the codewords and decode to the actions."""
+        rows = super().random_rows(rng, n)
+        k = th.as_tensor(rows[:, 0], device=self.device).long()
+        codebook = self.actor.codebook
+        centres = codebook.representative_latents(k)
+        latents = centres.clone()
+        undecided = th.arange(n, device=self.device)
+        spread = RANDOM_LATENT_NOISE
+        for _ in range(5):
+            noise = th.as_tensor(rng.normal(0, spread, (len(undecided), centres.shape[1])), dtype=th.float32)
+            candidates = (centres[undecided] + noise.to(self.device)).clamp(-1, 1)
+            fits = codebook.quantize(candidates) == k[undecided]
+            latents[undecided[fits]] = candidates[fits]
+            undecided = undecided[~fits]
+            if len(undecided) == 0:
+                break
+            spread /= 2
+        return np.concatenate([rows, latents.cpu().numpy()], axis=1)
+
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        Put the online networks in either training or evaluation mode; the targets stay in evaluation mode.
+
+        :param mode: if true, set to training mode, else set to evaluation mode
+        """
+        self.actor.set_training_mode(mode)
+        self.critic.set_training_mode(mode)
+        self.training = mode
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(
+            dict(
+                net_arch=self.net_arch,
+                activation_fn=self.activation_fn,
+                features_extractor_class=self.features_extractor_class,
+                features_extractor_kwargs=self.features_extractor_kwargs,
+                optimizer_class=self.optimizer_class,
+                optimizer_kwargs=self.optimizer_kwargs,
+                share_features_extractor=self.share_features_extractor,
+                diffusion=self.diffusion,
+                codebook=self.use_codebook,
+                n_diffusion_steps=self.n_diffusion_steps,
+                beta_schedule=self.beta_schedule,
+                variance_type=self.variance_type,
+                n_action_candidates=self.n_action_candidates,
+                exploration_noise=self.exploration_noise,
+                lr_schedule=self._dummy_schedule,  # dummy lr schedule, not needed for loading policy alone
+            )
+        )
+        return data
+
+
+MlpPolicy = CHDPPolicy
+
+
+class CnnPolicy(CHDPPolicy):
+    """
+    :class:`CHDPPolicy` for images.
+
+    :param features_extractor_class: features extractor to use
+    """
+
+    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN, **kwargs: Any):
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+
+
+class MultiInputPolicy(CHDPPolicy):
+    """
+    :class:`CHDPPolicy` for dict observations.
+
+    :param features_extractor_class: features extractor to use
+    """
+
+    def __init__(
+        self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any
+    ):
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)

@@ -1,0 +1,206 @@
+"""What SB3's OffPolicyAlgorithm needs to work with the user's own hybrid action space."""
+
+import io
+import pathlib
+from typing import Any, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_chdp.common.policies import HybridPolicy
+from sb3_chdp.common.spaces import HybridBox
+from sb3_chdp.common.type_aliases import HybridReplaySamples, name_columns
+from sb3_chdp.common.utils import check_finite, check_policy_kwargs
+
+SelfHybridOffPolicyAlgorithm = TypeVar("SelfHybridOffPolicyAlgorithm", bound="HybridOffPolicyAlgorithm")
+
+
+class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
+    """
+    Base class of off-policy algorithms for hybrid action spaces.
+
+    ``model.action_space`` is the user's space; environments and ``predict`` deal in native actions. Buffers and networks
+    deal in rows ``[k | scaled parameters | latent]``.
+
+    Parameters not listed here are SB3's (see :class:`OffPolicyAlgorithm`).
+
+    :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
+    :param exploration_fraction: fraction of the training over which the rate of uniformly random actions is reduced
+    :param exploration_initial_eps: initial probability of a uniformly random action
+    :param exploration_final_eps: final probability of a uniformly random action
+    """
+
+    policy: HybridPolicy
+
+    def __init__(
+        self,
+        policy: str | type[HybridPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule,
+        buffer_size: int = 1_000_000,  # 1e6
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = (1, "step"),
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        action_layout: str = "auto",
+        exploration_fraction: float = 0.1,
+        exploration_initial_eps: float = 1.0,
+        exploration_final_eps: float = 0.05,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+    ):
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            sde_support=False,
+            supported_action_spaces=(spaces.Tuple, spaces.Dict, spaces.OneOf),
+            support_multi_env=True,
+        )
+        self.action_layout = action_layout
+        self.exploration_fraction = exploration_fraction
+        self.exploration_initial_eps = exploration_initial_eps
+        self.exploration_final_eps = exploration_final_eps
+
+    def _network_kwargs(self) -> dict[str, Any]:
+        """:return: arguments of the algorithm that shape its networks, handed to the policy beside ``policy_kwargs``"""
+        return {}
+
+    def _latent_dim(self, n_discrete_actions: int) -> int:
+        """:return: number of latent columns that the algorithm stores behind the parameters"""
+        return 0
+
+    def _setup_model(self) -> None:
+        check_policy_kwargs(self.policy_class, self.policy_kwargs)
+        self.exploration_schedule = LinearSchedule(
+            self.exploration_initial_eps,
+            self.exploration_final_eps,
+            max(self.exploration_fraction, 1e-9),  # the schedule divides by it
+        )
+        native_space, policy_kwargs = self.action_space, self.policy_kwargs
+        hybrid_box = HybridBox(native_space, self.action_layout)
+        self.hybrid_space = HybridBox(
+            native_space, self.action_layout, self._latent_dim(hybrid_box.spec.n_discrete_actions)
+        )
+        # Buffer and policy are built for the rows; the model keeps the user's space
+        self.action_space = self.hybrid_space
+        self.policy_kwargs = {**policy_kwargs, **self._network_kwargs()}
+        try:
+            super()._setup_model()
+        finally:
+            self.action_space, self.policy_kwargs = native_space, policy_kwargs
+        # set_random_seed() seeded the stand-in
+        self.action_space.seed(None if self.seed is None else int(self.seed))
+
+    def _sample_action(
+        self,
+        learning_starts: int,
+        action_noise: ActionNoise | None = None,
+        n_envs: int = 1,
+    ) -> tuple[list[Any], np.ndarray]:  # type: ignore[override]
+        """
+        :param learning_starts: number of steps with uniformly random actions only
+        :param action_noise: noise that is added to the scaled parameters of the policy's actions
+        :param n_envs: number of environments
+        :return: native actions for the environments, (n_envs, columns) rows for the replay buffer
+        """
+        rng = self.action_space.np_random
+        explores = np.ones(n_envs, dtype=bool)
+        if self.num_timesteps >= learning_starts:
+            explores = rng.random(n_envs) < self.exploration_schedule(self._current_progress_remaining)
+        if explores.all():
+            rows = self.policy.random_rows(rng, n_envs)
+        else:
+            assert self._last_obs is not None, "self._last_obs was not set"
+            rows = self.policy.predict_rows(self._last_obs)  # type: ignore[arg-type]
+            spec = self.hybrid_space.spec
+            if action_noise is not None:
+                parameters = rows[:, 1 : spec.row_size] + action_noise()
+                rows[:, 1 : spec.row_size] = np.clip(parameters, -1, 1) * spec.mask[rows[:, 0].astype(int)]
+            if explores.any():
+                rows[explores] = self.policy.random_rows(rng, int(explores.sum()))
+        return self.hybrid_space.spec.to_native_batch(rows), rows
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        # Before the buffer is touched: one NaN would ruin the networks for good
+        check_finite("The observation", new_obs)
+        check_finite("The reward", reward)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _on_step(self) -> None:
+        super()._on_step()
+        self.logger.record("rollout/exploration_rate", self.exploration_schedule(self._current_progress_remaining))
+
+    def _sample_batch(self, batch_size: int) -> HybridReplaySamples:
+        assert self.replay_buffer is not None
+        replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+        return name_columns(replay_data, self.hybrid_space, self.gamma)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "hybrid_space"]
+
+    @classmethod
+    def load(  # noqa: D102
+        cls: type[SelfHybridOffPolicyAlgorithm],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfHybridOffPolicyAlgorithm:
+        data, _, _ = load_from_zip_file(path, device="cpu", custom_objects=custom_objects)
+        if not isinstance(path, (str, pathlib.Path)):
+            path.seek(0)
+        saved_class = (data or {}).get("policy_class")
+        accepted = tuple(cls.policy_aliases.values())
+        if not (isinstance(saved_class, type) and issubclass(saved_class, accepted)):
+            raise ValueError(f"{path} is not a {cls.__name__} model: its policy is {saved_class}, not one of {accepted}")
+        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+
+

@@ -1,0 +1,135 @@
+"""Policies that answer in the user's own action space."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_chdp.common.spaces import HybridBox
+from sb3_chdp.common.utils import check_finite
+
+
+class HybridPolicy(BasePolicy):
+    """
+    Base class of policies for hybrid action spaces.
+
+    Networks work on rows ``[k | scaled parameters | latent]`` (:class:`HybridBox`); ``predict`` returns native actions.
+    Subclasses implement ``_predict``, which returns rows.
+    """
+
+    action_space: HybridBox
+
+    def predict(  # type: ignore[override]
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[Any, tuple[np.ndarray, ...] | None]:
+        """
+        Get native actions from observations.
+
+        :param observation: the input observation
+        :param state: unused, returned as it is (these policies are not recurrent)
+        :param episode_start: unused
+        :param deterministic: whether to return the same action for the same observation every time
+        :return: one native action for one observation, a list of n native actions for n observations; and ``state``
+        :raises ValueError: if the observation holds NaN or infinity
+        """
+        rows, vectorized_env = self._predict_rows(observation, deterministic)
+        actions = self.action_space.spec.to_native_batch(rows)
+        return (actions if vectorized_env else actions[0]), state
+
+    def predict_rows(self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool = False) -> np.ndarray:
+        """
+        Like :meth:`predict`, for code that needs arrays.
+
+        :return: rows ``[k | scaled parameters | latent]``, (n, columns) for n observations, (columns,) for one
+        """
+        rows, vectorized_env = self._predict_rows(observation, deterministic)
+        return rows if vectorized_env else rows[0]
+
+    def _predict_rows(
+        self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool
+    ) -> tuple[np.ndarray, bool]:
+        self.set_training_mode(False)
+        # Common mistake, see https://github.com/DLR-RM/stable-baselines3/issues/1694
+        if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
+            raise ValueError(
+                "predict() got a tuple instead of an array or a dict: `obs, info = env.reset()` (Gymnasium) "
+                "and `obs = vec_env.reset()` (SB3) differ"
+            )
+        obs_tensor, vectorized_env = self.obs_to_tensor(observation)
+        tensors = obs_tensor if isinstance(obs_tensor, dict) else {"": obs_tensor}
+        if not all(bool(th.isfinite(tensor).all()) for tensor in tensors.values() if tensor.is_floating_point()):
+            parts = observation if isinstance(observation, dict) else {"observation": np.asarray(observation)}
+            for name, part in parts.items():
+                check_finite(name, np.asarray(part) if vectorized_env else np.asarray(part)[None])
+        with th.no_grad():
+            rows = self._predict(obs_tensor, deterministic=deterministic)
+        return rows.cpu().numpy(), vectorized_env
+
+    def random_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """
+        Uniformly random actions, for the warm-up and for exploration.
+
+        :param rng: random generator
+        :param n: number of rows
+        :return: (n, columns) rows
+        """
+        return self.action_space.spec.sample_rows(rng, n).astype(np.float32)
+
+
+class HybridCritic(ContinuousCritic):
+    """
+    SB3's twin critic Q(s, latent, parameters), with the features of the state computed once for several calls.
+
+    :param observation_space: observation space
+    :param action_dim: width of the concatenated action input
+    :param net_arch: hidden layers
+    :param features_extractor: network to extract features
+    :param features_dim: number of features
+    :param activation_fn: activation function
+    :param normalize_images: whether to divide images by 255
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_dim: int,
+        net_arch: list[int],
+        features_extractor: BaseFeaturesExtractor,
+        features_dim: int,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        normalize_images: bool = True,
+    ):
+        super().__init__(
+            observation_space,
+            spaces.Box(-np.inf, np.inf, (action_dim,)),
+            net_arch,
+            features_extractor,
+            features_dim,
+            activation_fn=activation_fn,
+            normalize_images=normalize_images,
+            n_critics=2,
+            share_features_extractor=False,
+        )
+
+    def features(self, obs: PyTorchObs) -> th.Tensor:
+        """:return: (B, features_dim) features of the observations"""
+        return self.extract_features(obs, self.features_extractor)
+
+    def q_values(self, features: th.Tensor, *actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param features: (B, features_dim) from :meth:`features`
+        :param actions: the parts of the action input, each (B, n)
+        :return: Q1 and Q2, each (B, 1)
+        """
+        q_input = th.cat([features, *actions], dim=1)
+        q1, q2 = (q_net(q_input) for q_net in self.q_networks)
+        return q1, q2

@@ -1,0 +1,45 @@
+"""Typed views of what the replay buffer returns."""
+
+from typing import NamedTuple
+
+import torch as th
+from stable_baselines3.common.type_aliases import PyTorchObs, ReplayBufferSamples
+
+from sb3_chdp.common.spaces import HybridBox
+
+
+class HybridReplaySamples(NamedTuple):
+    """
+    A batch with the columns of its action rows named.
+
+    Shapes: discrete_actions (B,) int64, parameters (B, Pmax) in [-1, 1] with padding 0, latents (B, latent_dim),
+    rewards, dones and discounts (B, 1).
+    """
+
+    observations: PyTorchObs
+    discrete_actions: th.Tensor
+    parameters: th.Tensor
+    latents: th.Tensor
+    next_observations: PyTorchObs
+    dones: th.Tensor
+    rewards: th.Tensor
+    discounts: th.Tensor | float
+
+
+def name_columns(replay_data: ReplayBufferSamples, action_space: HybridBox, gamma: float) -> HybridReplaySamples:
+    """
+    :param replay_data: what ``ReplayBuffer.sample`` returned
+    :param action_space: the space of the stored rows
+    :param gamma: discount factor, used if the buffer gives none (n-step buffers do)
+    """
+    row_size = action_space.spec.row_size
+    return HybridReplaySamples(
+        observations=replay_data.observations,
+        discrete_actions=replay_data.actions[:, 0].long(),
+        parameters=replay_data.actions[:, 1:row_size],
+        latents=replay_data.actions[:, row_size:],
+        next_observations=replay_data.next_observations,
+        dones=replay_data.dones,
+        rewards=replay_data.rewards,
+        discounts=gamma if replay_data.discounts is None else replay_data.discounts,
+    )

@@ -1,0 +1,51 @@
+"""Small helpers that the algorithms share."""
+
+import inspect
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import torch as th
+
+
+def polyak_update(params: Iterable[th.Tensor], target_params: Iterable[th.Tensor], tau: float) -> None:
+    """
+    SB3's ``polyak_update`` in one fused operation: target <- (1 - tau) * target + tau * parameter.
+
+    :param params: online parameters
+    :param target_params: target parameters, in the same order
+    :param tau: soft update coefficient in [0, 1]
+    """
+    with th.no_grad():
+        th._foreach_lerp_(list(target_params), list(params), tau)
+
+
+def check_finite(name: str, value: np.ndarray | dict[str, np.ndarray]) -> None:
+    """
+    :param name: what the value is, for the message
+    :param value: array, or dict of arrays
+    :raises ValueError: if a float array holds NaN or infinity; the message names the environments concerned
+    """
+    if isinstance(value, dict):
+        for key, part in value.items():
+            check_finite(f"{name}[{key!r}]", part)
+        return
+    if value.dtype.kind == "f" and not np.isfinite(value).all():
+        rows = value.reshape(len(value), -1) if value.ndim > 1 else value[:, None]
+        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1)).tolist()
+        raise ValueError(f"{name} must be finite, got NaN or inf from environment(s) {bad}: {value[bad]}")
+
+
+def check_policy_kwargs(policy_class: type, policy_kwargs: dict[str, Any]) -> None:
+    """
+    :raises ValueError: if the policy has no such argument; the message lists those it has
+    """
+    parameters = inspect.signature(policy_class).parameters
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+        return
+    accepted = set(parameters) - {"observation_space", "action_space", "lr_schedule", "self"}
+    unknown = set(policy_kwargs) - accepted
+    if unknown:
+        raise ValueError(
+            f"policy_kwargs has unknown key(s) {sorted(unknown)}; {policy_class.__name__} accepts {sorted(accepted)}"
+        )
