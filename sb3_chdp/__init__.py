@@ -2,8 +2,10 @@ from pathlib import Path
 
 import sb3_chdp.envs  # registers the environments
 from sb3_chdp.chdp import CHDP
+from sb3_chdp.common.env_checker import check_hybrid_env
 from sb3_chdp.common.spaces import HybridActionSpec
+from sb3_chdp.wrappers import FlattenHybridAction
 
 __version__ = Path(__file__).with_name("version.txt").read_text().strip()
 
-__all__ = ["CHDP", "HybridActionSpec"]
+__all__ = ["CHDP", "FlattenHybridAction", "HybridActionSpec", "check_hybrid_env"]

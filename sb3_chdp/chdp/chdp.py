@@ -32,11 +32,13 @@ class CHDP(HybridOffPolicyAlgorithm):
     Paper: Liu et al., "CHDP: Cooperative Hybrid Diffusion Policies for Reinforcement Learning in Parameterized Action
     Space", AAAI 2026. No reference code is published.
 
-    Differences from the paper, all of them arguments:
+    Differences from the paper:
         1. the action of highest Q among ``n_action_candidates`` draws acts (1: the paper);
         2. uniformly random actions with a decreasing probability, see ``exploration_initial_eps`` (0: the paper);
         3. latents from the buffer that no longer decode to the action taken are replaced, see ``relabel_latents``;
-        4. gradient norms are clipped, see ``max_grad_norm``.
+        4. gradient norms are clipped, see ``max_grad_norm``;
+        5. codewords are kept in [-1, 1], where the latents are (not an argument: without it they drift away, and latents
+           can no longer reach them).
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str), with a hybrid action space
@@ -265,6 +267,7 @@ class CHDP(HybridOffPolicyAlgorithm):
                 diffusion_loss, q_loss, k = self._continuous_policy_loss(replay_data, actor_features, critic_features)
                 continuous_loss = diffusion_loss + alpha * q_loss
                 self._optimize(continuous_loss, policy.continuous_optimizer, policy.codebook_optimizer)
+                self.actor.codebook.project()
                 losses |= {"continuous_loss": continuous_loss, "diffusion_loss_continuous": diffusion_loss}
 
                 polyak_update(self._online_params, self._target_params, self.tau)

@@ -35,8 +35,13 @@ class Codebook(nn.Module):
         return self.codewords[k]
 
     def representative_latents(self, k: th.Tensor) -> th.Tensor:
-        """:return: (B, d_e) latents in [-1, 1] that stand for the discrete actions"""
-        return self.codewords.detach()[k].clamp(-1, 1)
+        """:return: (B, d_e) latents that stand for the discrete actions, their codewords"""
+        return self.codewords.detach()[k]
+
+    def project(self) -> None:
+        """Move the codewords back into [-1, 1], where the latents are, after a gradient step."""
+        with th.no_grad():
+            self.codewords.clamp_(-1, 1)
 
 
 class OneHotCodebook(nn.Module):
@@ -61,3 +66,6 @@ class OneHotCodebook(nn.Module):
     def representative_latents(self, k: th.Tensor) -> th.Tensor:
         """:return: (B, K) vectors of 1 at k and -1 elsewhere"""
         return 2 * self(k) - 1
+
+    def project(self) -> None:
+        """Nothing to do, see :meth:`Codebook.project`."""

@@ -183,34 +183,39 @@ class DiffusionModel(nn.Module):
         x_start = self.predict_start_from_noise(x, i, noise).clamp(-1, 1)
         return self.schedule.posterior_mean_coef1[i] * x_start + self.schedule.posterior_mean_coef2[i] * x
 
+    def draw_noise(self, n: int, generator: th.Generator | None = None) -> th.Tensor:
+        """
+        :param n: number of chains
+        :param generator: random generator, the global one of the model's device if None
+        :return: (N, n, dim) noise for :meth:`sample`: the start x_N, then what is injected at steps 1 to N - 1
+        """
+        device = self._levels.device
+        if generator is not None:
+            return th.randn((self.schedule.n_steps, n, self.dim), generator=generator).to(device)
+        return th.randn((self.schedule.n_steps, n, self.dim), device=device)
+
     def sample(
-        self,
-        condition: th.Tensor,
-        initial_noise: th.Tensor | None = None,
-        mask: th.Tensor | None = None,
-        deterministic: bool = False,
+        self, condition: th.Tensor, noise: th.Tensor | None = None, mask: th.Tensor | None = None
     ) -> th.Tensor:
         """
         Run the whole reverse chain; gradients flow through it.
 
         :param condition: (B, condition_dim)
-        :param initial_noise: (B, dim) x_N, drawn if None
+        :param noise: (N, B, dim) from :meth:`draw_noise`, drawn if None
         :param mask: (B, dim) 1 for the entries that exist, None if all do; the others stay 0
-        :param deterministic: whether to inject no noise on the way
         :return: (B, dim) x_0 in [-1, 1]
         """
-        n_steps = self.schedule.n_steps
-        shape = (condition.shape[0], self.dim)
-        x = th.randn(shape, device=condition.device) if initial_noise is None else initial_noise
-        injected = None if deterministic else th.randn((n_steps, *shape), device=condition.device).unbind()
+        if noise is None:
+            noise = self.draw_noise(len(condition))
+        x, *injected = noise.unbind()
         context = self.noise_predictor.condition_context(condition)
         times = self.noise_predictor.time_context().unbind()
-        for i in reversed(range(n_steps)):
+        for i in reversed(range(self.schedule.n_steps)):
             if mask is not None:
                 x = x * mask
             x = self.p_mean(x, i, self.noise_predictor(x, context + times[i]))
-            if injected is not None and i > 0:
-                x = th.add(x, injected[i], alpha=self.schedule.sigmas[i])
+            if i > 0:
+                x = th.add(x, injected[i - 1], alpha=self.schedule.sigmas[i])
         x = x.clamp(-1, 1)
         return x if mask is None else x * mask
 
@@ -270,17 +275,20 @@ class DeterministicModel(nn.Module):
         self.exploration_noise = exploration_noise
         self.mlp = nn.Sequential(*create_mlp(condition_dim, dim, net_arch, activation_fn, squash_output=True))
 
+    def draw_noise(self, n: int, generator: th.Generator | None = None) -> th.Tensor:
+        """:return: (n, dim) exploration noise for :meth:`sample`, 0 if a generator asks for a repeatable sample"""
+        device = self.mlp[0].weight.device
+        if generator is not None:
+            return th.zeros((n, self.dim), device=device)
+        return self.exploration_noise * th.randn((n, self.dim), device=device)
+
     def sample(
-        self,
-        condition: th.Tensor,
-        initial_noise: th.Tensor | None = None,
-        mask: th.Tensor | None = None,
-        deterministic: bool = False,
+        self, condition: th.Tensor, noise: th.Tensor | None = None, mask: th.Tensor | None = None
     ) -> th.Tensor:
-        """See :meth:`DiffusionModel.sample`; ``initial_noise`` is not used."""
-        x = self.mlp(condition)
-        if not deterministic:
-            x = (x + self.exploration_noise * th.randn_like(x)).clamp(-1, 1)
+        """See :meth:`DiffusionModel.sample`; the noise is (B, dim)."""
+        if noise is None:
+            noise = self.draw_noise(len(condition))
+        x = (self.mlp(condition) + noise).clamp(-1, 1)
         return x if mask is None else x * mask
 
     def diffusion_loss(self, x_start: th.Tensor, condition: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:

@@ -74,34 +74,27 @@ class CooperativeActor(BaseModel):
         """:return: (B, Pmax) 1 for the parameters that action k has, None if no action has padding"""
         return self.parameter_mask[k] if self._has_padding else None
 
-    def sample_parameters(
-        self, features: th.Tensor, k: th.Tensor, initial_noise: th.Tensor | None = None, deterministic: bool = False
-    ) -> th.Tensor:
+    def sample_parameters(self, features: th.Tensor, k: th.Tensor, noise: th.Tensor | None = None) -> th.Tensor:
         """
         :param features: (B, features_dim)
         :param k: (B,) discrete actions
-        :param initial_noise: (B, Pmax) start of the chain, drawn if None
-        :param deterministic: whether to inject no noise on the way
+        :param noise: noise of the continuous policy's chain, drawn if None
         :return: (B, Pmax) parameters in [-1, 1], padding 0; their gradient reaches the codewords of k
         """
         condition = th.cat([features, self.codebook(k)], dim=1)
-        return self.continuous_policy.sample(condition, initial_noise, self.mask(k), deterministic)
+        return self.continuous_policy.sample(condition, noise, self.mask(k))
 
     def sample(
-        self,
-        features: th.Tensor,
-        initial_noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None),
-        deterministic: bool = False,
+        self, features: th.Tensor, noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None)
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """
         :param features: (B, features_dim)
-        :param initial_noise: starts of the two chains, drawn if None
-        :param deterministic: whether to inject no noise on the way
+        :param noise: noise of the two chains, drawn if None
         :return: latents (B, latent_dim), discrete actions (B,), parameters (B, Pmax)
         """
-        latents = self.discrete_policy.sample(features, initial_noise[0], deterministic=deterministic)
+        latents = self.discrete_policy.sample(features, noise[0])
         k = self.codebook.quantize(latents)
-        return latents, k, self.sample_parameters(features, k, initial_noise[1], deterministic)
+        return latents, k, self.sample_parameters(features, k, noise[1])
 
 
 class CHDPPolicy(HybridPolicy):
@@ -219,11 +212,11 @@ class CHDPPolicy(HybridPolicy):
         if self.use_codebook:
             self.codebook_optimizer = self._make_optimizer(list(codebook.parameters()), lr_schedule)
 
-        # Starts of the chains of deterministic predictions, the same for every observation and every model
+        # Noise of deterministic predictions, the same for every observation and every model
         generator = th.Generator().manual_seed(0)
-        for name, dim in (("latent_noise", latent_dim), ("parameter_noise", spec.max_parameters)):
-            noise = th.randn((self.n_action_candidates, dim), generator=generator)
-            self.register_buffer(f"deterministic_{name}", noise, persistent=False)
+        for name, model in (("latent", self.actor.discrete_policy), ("parameter", self.actor.continuous_policy)):
+            noise = model.draw_noise(self.n_action_candidates, generator)
+            self.register_buffer(f"fixed_{name}_noise", noise, persistent=False)
 
     def _make_model(self, dim: int, condition_dim: int, net_arch: list[int]) -> DiffusionModel | DeterministicModel:
         if not self.diffusion:
@@ -253,17 +246,18 @@ class CHDPPolicy(HybridPolicy):
         """
         Draw ``n_action_candidates`` actions per observation and keep the one of highest target min(Q1, Q2).
 
+        Deterministic predictions draw with the same noise every time.
+
         :return: (B, 1 + Pmax + latent_dim) rows
         """
         n_candidates = self.n_action_candidates
         features = self.actor_features(observation)
         batch_size = features.shape[0]
-        initial_noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None)
+        noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None)
         if deterministic:
-            starts = (self.deterministic_latent_noise, self.deterministic_parameter_noise)
-            initial_noise = tuple(start.repeat(batch_size, 1) for start in starts)  # type: ignore[assignment]
+            noise = tuple(th.cat([fixed] * batch_size, dim=-2) for fixed in (self.fixed_latent_noise, self.fixed_parameter_noise))
         features = features.repeat_interleave(n_candidates, dim=0)
-        latents, k, parameters = self.actor.sample(features, initial_noise, deterministic)
+        latents, k, parameters = self.actor.sample(features, noise)
         rows = th.cat([k[:, None].float(), parameters, latents], dim=1)
         if n_candidates == 1:
             return rows

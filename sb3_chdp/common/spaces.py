@@ -137,8 +137,6 @@ class HybridActionSpec:
                 raise ValueError("action_layout='shared' does not apply to a OneOf space, whose parts exclude each other")
             self._discrete_leaves: list[_DiscreteLeaf] = []
             options = [(("option",), option) for option in space.spaces]
-            # The part of the native action after the index lives under the key "option" while it is being built
-            templates = [{"option": self._template(option)} for option in space.spaces]
             self.is_shared = False
         elif isinstance(space, (spaces.Tuple, spaces.Dict)):
             choice = None if layout == "shared" else self._find_options(space)
@@ -152,7 +150,6 @@ class HybridActionSpec:
                 discrete_path, options = choice
                 discrete_space = _get(space, discrete_path)
                 self._discrete_leaves = [_DiscreteLeaf(discrete_path, discrete_space, *_digits(discrete_space))]
-            templates = [self._template(space)]
         else:
             raise ValueError(f"The action space must be a Tuple, Dict or OneOf with a discrete and a continuous part, got {space}")
 
@@ -164,8 +161,12 @@ class HybridActionSpec:
         if n_joint > MAX_DISCRETE_ACTIONS:
             raise ValueError(f"{n_joint} joint discrete actions are more than the {MAX_DISCRETE_ACTIONS} supported, in {space}")
         self.n_discrete_actions = n_joint
-        self._templates = templates
         self._boxes = [self._collect_boxes(option, path) for path, option in options]
+        if isinstance(space, spaces.OneOf):
+            # The part of the native action behind the index lives under the key "option" while it is being built
+            self._templates = [{"option": self._template(option)} for option in space.spaces]
+        else:
+            self._templates = [self._template(space)]
         self._build_tables()
 
     @staticmethod
@@ -290,7 +291,8 @@ class HybridActionSpec:
             # The bounds of 64-bit integers are not floats: clip before the cast and after it
             limits = np.iinfo(box.dtype)
             values = np.clip(values, np.nextafter(float(limits.min), 0), np.nextafter(float(limits.max), 0))
-        return np.clip(values.reshape(box.shape).astype(box.dtype), box.low, box.high)
+        # asarray: clip makes scalars of 0-dimensional arrays
+        return np.asarray(np.clip(values.reshape(box.shape).astype(box.dtype), box.low, box.high))
 
     def to_native(self, row: np.ndarray) -> Any:
         """

@@ -1,0 +1,3 @@
+from sb3_chdp.cli import main
+
+main()

@@ -1,0 +1,82 @@
+"""
+The command ``sb3-chdp``: rl_zoo3's scripts with the algorithms and environments of this package.
+
+    sb3-chdp train --env Platform-v0 -P          train, with rl_zoo3's options; --algo is chdp by default
+    sb3-chdp optimize --env Goal-v0 --n-trials 50      tune hyperparameters with Optuna
+    sb3-chdp enjoy --env Platform-v0 -f logs     watch a trained agent
+    sb3-chdp record --env Platform-v0 -f logs    record a video of it
+    sb3-chdp plot --algo chdp --env Platform-v0 -f logs -y success     learning curves
+    sb3-chdp all_plots | plot_from_file | record_training   the other scripts of rl_zoo3
+"""
+
+import importlib.util
+import runpy
+import sys
+
+SCRIPTS = {
+    "train": "rl_zoo3.train",
+    "optimize": "rl_zoo3.train",
+    "enjoy": "rl_zoo3.enjoy",
+    "record": "rl_zoo3.record_video",
+    "record_training": "rl_zoo3.record_training",
+    "plot": "rl_zoo3.plots.plot_train",
+    "all_plots": "rl_zoo3.plots.all_plots",
+    "plot_from_file": "rl_zoo3.plots.plot_from_file",
+}
+# Scripts for which one algorithm is named by --algo
+WITH_ALGO = ("train", "optimize", "enjoy", "record", "record_training")
+# What rl_zoo3 2.9.2 imports, declared by it or not
+REQUIRED = ("rl_zoo3", "requests", "pandas", "tensorboard")
+
+
+def _option(arguments: list[str], *names: str) -> str | None:
+    """:return: value of the first of the named options that is given, None if none is"""
+    for i, argument in enumerate(arguments):
+        name, _, value = argument.partition("=")
+        if name in names:
+            return value or (arguments[i + 1] if i + 1 < len(arguments) else "")
+    return None
+
+
+def prepare_arguments(command: str, arguments: list[str]) -> list[str]:
+    """
+    :param command: a key of ``SCRIPTS``
+    :param arguments: what the user wrote behind it
+    :return: the arguments for rl_zoo3's script
+    """
+    from sb3_chdp.zoo import HYPERPARAMS_FOLDER
+
+    arguments = list(arguments)
+    if command in WITH_ALGO and _option(arguments, "--algo") is None:
+        arguments = ["--algo", "chdp", *arguments]
+    if command == "optimize" and not {"-optimize", "--optimize-hyperparameters"} & set(arguments):
+        arguments.append("--optimize-hyperparameters")
+    if command in ("train", "optimize"):
+        config = HYPERPARAMS_FOLDER / f"{_option(arguments, '--algo')}.yml"
+        # In front, so that a -conf of the user wins; rl_zoo3 has the files of its own algorithms
+        if config.is_file():
+            arguments = ["-conf", str(config), *arguments]
+    return arguments
+
+
+def main() -> None:
+    """Entry point of ``sb3-chdp`` and ``python -m sb3_chdp``."""
+    if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
+        print(__doc__)
+        return
+    command, arguments = sys.argv[1], sys.argv[2:]
+    if command not in SCRIPTS:
+        sys.exit(f"sb3-chdp: unknown command {command!r}, choose from {', '.join(SCRIPTS)}")
+    missing = [name for name in REQUIRED if importlib.util.find_spec(name) is None]
+    if missing:
+        sys.exit(f"sb3-chdp {command} needs {', '.join(missing)}: pip install 'sb3-chdp[zoo]'")
+
+    from sb3_chdp.zoo import register
+
+    register()
+    sys.argv = [f"sb3-chdp {command}", *prepare_arguments(command, arguments)]
+    runpy.run_module(SCRIPTS[command], run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""Small environments with hybrid actions in every layout and several kinds of observations."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+UNIT = spaces.Box(-1.0, 1.0, (1,), dtype=np.float32)
+
+
+def box(low: float, high: float, *shape: int) -> spaces.Box:
+    return spaces.Box(low, high, shape, dtype=np.float32)
+
+
+def layouts() -> dict[str, spaces.Space]:
+    """:return: one action space per layout, with 3 discrete actions, parameter sizes differ where they can"""
+    return {
+        "nested": spaces.Tuple((spaces.Discrete(3), spaces.Tuple((box(-1, 1, 2), box(0, 5, 1), box(-1, 1, 0))))),
+        "flat": spaces.Tuple((spaces.Discrete(3), box(-2, 3, 1), box(-1, 1, 2), box(0, 1, 1))),
+        "shared": spaces.Tuple((spaces.Discrete(3), box(-4, 4, 2))),
+        "dict": spaces.Dict({"kind": spaces.Discrete(3), "values": spaces.Tuple((box(0, 1, 1), box(0, 2, 1), box(0, 3, 2)))}),
+        "one_of": spaces.OneOf((box(-1, 1, 1), box(0, 1, 2), box(5, 6, 1))),
+        "product": spaces.Dict({"a": spaces.MultiDiscrete([2, 2]), "b": spaces.MultiBinary(1), "x": box(-1, 1, 2)}),
+    }
+
+
+class LayoutEnv(gym.Env):
+    """
+    Random observations; an action outside of the action space is an error.
+
+    :param action_space: native action space
+    :param observation_space: observation space, two floats if None
+    :param episode_length: steps of an episode, which ends by truncation
+    """
+
+    def __init__(
+        self, action_space: spaces.Space, observation_space: spaces.Space | None = None, episode_length: int = 10
+    ):
+        self.action_space = action_space
+        self.observation_space = observation_space or spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
+        self.episode_length = episode_length
+        self.t = 0
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
+        super().reset(seed=seed)
+        if seed is not None:
+            self.observation_space.seed(seed)
+        self.t = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        if not self.action_space.contains(action):
+            raise ValueError(f"{action!r} is not in {self.action_space}")
+        self.t += 1
+        truncated = self.t >= self.episode_length
+        return self.observation_space.sample(), float(self.np_random.normal()), False, truncated, {"is_success": False}
+
+
+def make_layout_env(layout: str = "nested", **kwargs: Any) -> LayoutEnv:
+    return LayoutEnv(layouts()[layout], **kwargs)
+
+
+class HybridIdentityEnv(gym.Env):
+    """
+    Reward 1 if the discrete action is the observed one and its parameter lies within 0.3 of the observed value.
+
+    Chance level of uniformly random actions: 0.09 for 3 actions. Episodes last one step.
+
+    :param n_actions: number of discrete actions
+    """
+
+    def __init__(self, n_actions: int = 3):
+        self.n_actions = n_actions
+        self.action_space = spaces.Tuple((spaces.Discrete(n_actions), spaces.Tuple([UNIT] * n_actions)))
+        self.observation_space = spaces.Box(-1.0, 1.0, (n_actions + 1,), dtype=np.float32)
+        self.choice, self.value = 0, 0.0
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.choice = int(self.np_random.integers(self.n_actions))
+        self.value = float(self.np_random.uniform(-1, 1))
+        obs = np.full(self.n_actions + 1, -1.0, dtype=np.float32)
+        obs[self.choice], obs[-1] = 1.0, self.value
+        return obs, {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
+        k, parameters = action
+        success = k == self.choice and abs(float(parameters[k][0]) - self.value) < 0.3
+        obs, _ = self.reset()
+        return obs, float(success), True, False, {"is_success": success}

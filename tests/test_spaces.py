@@ -1,0 +1,185 @@
+import pickle
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_chdp import HybridActionSpec
+from sb3_chdp.common.spaces import HybridAction, HybridBox
+from tests.hybrid_envs import box, layouts
+
+
+@st.composite
+def boxes(draw, min_size=0):
+    shape = draw(st.sampled_from([(0,), (), (1,), (2,), (2, 3), (3, 0)]) if min_size == 0 else st.sampled_from([(1,), (), (2, 2)]))
+    dtype = draw(st.sampled_from([np.float32, np.float64, np.float16, np.int64, np.int32, np.uint8]))
+    size = int(np.prod(shape))
+    limits = (0, 255) if dtype is np.uint8 else (-1000, 1000)
+    numbers = st.integers(*limits) if np.issubdtype(dtype, np.integer) else st.floats(*limits, width=16)
+    pairs = [sorted((draw(numbers), draw(numbers))) for _ in range(size)]
+    low, high = np.array(pairs, dtype=dtype).reshape(size, 2).T + dtype(0)  # no -0.0: Box(0.0, -0.0) can not be sampled
+    return spaces.Box(low.reshape(shape), high.reshape(shape), dtype=dtype)
+
+
+@st.composite
+def hybrid_spaces(draw):
+    layout = draw(st.sampled_from(["nested", "flat", "shared", "dict_nested", "dict_flat", "one_of", "product"]))
+    n_actions = draw(st.integers(1, 4))
+    discrete = spaces.Discrete(n_actions, start=draw(st.integers(-3, 3)))
+    # At least one action has a parameter
+    options = [draw(boxes(min_size=1)), *(draw(boxes()) for _ in range(n_actions - 1))]
+    if layout == "nested":
+        return spaces.Tuple((discrete, spaces.Tuple(options)))
+    if layout == "flat":
+        return spaces.Tuple((discrete, *options))
+    if layout == "shared":
+        return spaces.Tuple((options[0], discrete))
+    if layout == "dict_nested":
+        return spaces.Dict({"which": discrete, "how": spaces.Dict({f"p{i}": option for i, option in enumerate(options)})})
+    if layout == "dict_flat":
+        return spaces.Dict({"which": discrete, **{f"p{i}": option for i, option in enumerate(options)}})
+    if layout == "one_of":
+        return spaces.OneOf(options)
+    others = [spaces.MultiDiscrete([2, 3]), spaces.MultiBinary((2, 1)), spaces.MultiDiscrete([[2], [1]])]
+    return spaces.Tuple((discrete, draw(st.sampled_from(others)), spaces.Dict({"x": options[0], "y": box(-1, 1, 2)})))
+
+
+def active_parts(spec, action):
+    """Discrete parts and parameters of the chosen action: what a row must keep."""
+    row = spec.to_row(action)
+    return row, spec.to_native(row)
+
+
+@settings(max_examples=300, deadline=None)
+@given(space=hybrid_spaces(), seed=st.integers(0, 2**16))
+def test_native_actions_are_in_the_space_and_round_trip(space, seed):
+    spec = HybridActionSpec(space)
+    space.seed(seed)
+    rng = np.random.default_rng(seed)
+    rows = spec.sample_rows(rng, 4)
+    rows[:2, 1:] *= 1e6  # far outside of [-1, 1]
+    for native in spec.to_native_batch(rows):
+        assert space.contains(native), native
+        # Everything in a native action that was made from a row comes back
+        np.testing.assert_equal(spec.to_native(spec.to_row(native)), native)
+    for _ in range(4):
+        sample = space.sample()
+        row, native = active_parts(spec, sample)
+        k = int(row[0])
+        assert space.contains(native)
+        assert not row[1:][~spec.mask[k]].any()
+        np.testing.assert_equal(spec.to_row(native)[0], k)
+        for leaf in spec._boxes[0 if spec.is_shared else k]:
+            path = leaf.path[1:] if isinstance(space, spaces.OneOf) else leaf.path
+            before, after = (sample[1], native[1]) if isinstance(space, spaces.OneOf) else (sample, native)
+            for key in path:
+                before, after = before[key], after[key]
+            width = float(np.max(leaf.space.high.astype(float) - leaf.space.low.astype(float), initial=0.0))
+            np.testing.assert_allclose(after, before, rtol=0, atol=4e-16 * max(width, 1000))
+
+
+@settings(max_examples=100, deadline=None)
+@given(radices=st.lists(st.integers(1, 4), min_size=1, max_size=4), seed=st.integers(0, 1000))
+def test_joint_index_is_a_bijection(radices, seed):
+    space = spaces.Tuple((spaces.MultiDiscrete(radices), spaces.MultiBinary(2), box(-1, 1, 1)))
+    spec = HybridActionSpec(space)
+    assert spec.n_discrete_actions == 4 * np.prod(radices)
+    natives = [spec.to_native([k, 0.0]) for k in range(spec.n_discrete_actions)]
+    assert len({(tuple(a), tuple(b)) for a, b, _ in natives}) == spec.n_discrete_actions
+    assert [spec.to_row(native)[0] for native in natives] == list(range(spec.n_discrete_actions))
+
+
+def test_tables():
+    spec = HybridActionSpec(layouts()["nested"])
+    assert (spec.n_discrete_actions, spec.max_parameters, spec.n_parameters, spec.row_size) == (3, 2, 3, 3)
+    assert spec.parameter_sizes.tolist() == [2, 1, 0]
+    assert spec.mask.tolist() == [[True, True], [True, False], [False, False]]
+    assert spec.parameter_index.tolist() == [[0, 1], [2, 0], [0, 0]]
+    k, parameters = spec.to_native([1, 0.5, 0.9])
+    assert k == 1 and parameters[1] == pytest.approx(3.75)
+
+
+@pytest.mark.parametrize("layout", layouts())
+def test_conversion_of_a_batch_equals_single_conversions(layout):
+    spec = HybridActionSpec(layouts()[layout])
+    rows = spec.sample_rows(np.random.default_rng(0), 50)
+    np.testing.assert_equal(spec.to_native_batch(rows), [spec.to_native(row) for row in rows])
+
+
+@pytest.mark.parametrize("empty", [box(0, 1, 0), spaces.Tuple(()), spaces.Dict({}), spaces.Discrete(1)])
+def test_spellings_of_an_action_without_parameters(empty):
+    for space in (
+        spaces.Tuple((spaces.Discrete(2), spaces.Tuple((box(0, 1, 1), empty)))),
+        spaces.Tuple((spaces.Discrete(2), box(0, 1, 1), empty)),
+        spaces.OneOf((box(0, 1, 1), empty)),
+    ):
+        spec = HybridActionSpec(space)
+        assert spec.parameter_sizes.tolist() == [1, 0]
+        assert all(space.contains(spec.to_native([k, 0.3])) for k in range(2))
+
+
+def test_ambiguous_space_and_override():
+    space = spaces.Tuple((spaces.Discrete(2), box(0, 1, 1), box(0, 1, 1)))
+    assert not HybridActionSpec(space).is_shared
+    assert HybridActionSpec(space, "shared").max_parameters == 2
+    assert HybridActionSpec(spaces.Tuple((spaces.Discrete(3), box(0, 1, 1), box(0, 1, 1)))).is_shared
+    with pytest.raises(ValueError, match="per_action"):
+        HybridActionSpec(spaces.Tuple((spaces.Discrete(3), box(0, 1, 1))), "per_action")
+    with pytest.raises(ValueError, match="action_layout must be one of"):
+        HybridActionSpec(space, "both")
+
+
+@pytest.mark.parametrize(
+    "space, message",
+    [
+        (spaces.Tuple((spaces.Discrete(2), box(-np.inf, np.inf, 1))), r"action_space\[1\] is unbounded"),
+        (spaces.Dict({"k": spaces.Discrete(2), "v": box(0, np.inf, 1)}), r"action_space\['v'\] is unbounded"),
+        (spaces.Tuple((box(0, 1, 1), box(0, 1, 1))), "no discrete part"),
+        (spaces.Tuple((spaces.Discrete(2), spaces.Discrete(3))), "no continuous part"),
+        (spaces.Tuple((spaces.Discrete(2), box(0, 1, 0))), "no continuous part"),
+        (spaces.Tuple((spaces.Discrete(2), spaces.Text(3))), "Text"),
+        (spaces.Tuple((spaces.MultiBinary(17), box(0, 1, 1))), "131072 joint discrete actions"),
+        (spaces.Tuple((spaces.MultiBinary(70), box(0, 1, 1))), "joint discrete actions"),
+        (spaces.OneOf((box(0, 1, 1), spaces.Discrete(3))), "OneOf"),
+        (spaces.Discrete(3), "Tuple, Dict or OneOf"),
+    ],
+)
+def test_unsupported_spaces(space, message):
+    with pytest.raises(ValueError, match=message):
+        HybridActionSpec(space)
+
+
+def test_nan_bounds():
+    space = box(0, 1, 1)
+    space.low[:] = np.nan
+    with pytest.raises(ValueError, match="NaN bounds"):
+        HybridActionSpec(spaces.Tuple((spaces.Discrete(2), space)))
+
+
+def test_large_joint_space():
+    spec = HybridActionSpec(spaces.Tuple((spaces.MultiBinary(16), box(-1, 1, 2))))
+    assert spec.n_discrete_actions == 65_536
+    bits, _ = spec.to_native([40_000, 0, 0])
+    assert int("".join(map(str, bits)), 2) == 40_000
+
+
+def test_row_out_of_range():
+    with pytest.raises(ValueError, match="first column"):
+        HybridActionSpec(layouts()["shared"]).to_native([3, 0, 0])
+
+
+def test_hybrid_action_is_a_tuple_for_others():
+    action = HybridActionSpec(layouts()["shared"]).to_native([2, 0.5, -0.5])
+    assert isinstance(action, tuple) and np.asarray([action, action]).shape == (2, 3)
+    assert type(pickle.loads(pickle.dumps(action))) is tuple
+    assert isinstance(action, HybridAction)
+
+
+def test_hybrid_box_pickles_and_compares():
+    first = HybridBox(layouts()["nested"], latent_dim=4)
+    assert first.shape == (7,)
+    assert pickle.loads(pickle.dumps(first)) == first
+    assert first != HybridBox(layouts()["nested"], latent_dim=5) and first != HybridBox(layouts()["flat"], latent_dim=4)
+    assert first != spaces.Box(first.low, first.high)
