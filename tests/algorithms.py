@@ -1,0 +1,13 @@
+"""The algorithms that the shared tests run on, with small settings."""
+
+from sb3_chdp import CHDP
+from tests.hybrid_envs import layouts
+
+ALGORITHMS = [CHDP]
+SMALL = {CHDP: dict(n_diffusion_steps=2, n_action_candidates=2, latent_dim=3)}
+LAYOUTS = list(layouts())
+
+
+def make_model(algorithm, env, policy="MlpPolicy", **kwargs):
+    settings = dict(batch_size=8, learning_starts=12, buffer_size=500, policy_kwargs=dict(net_arch=[8, 8]), seed=0)
+    return algorithm(policy, env, **{**settings, **SMALL[algorithm], **kwargs})

@@ -1,0 +1,228 @@
+"""Everything that an SB3 user does with a model, on every layout of hybrid actions."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecCheckNan,
+    VecFrameStack,
+    VecMonitor,
+    VecNormalize,
+)
+
+from sb3_chdp import CHDP, FlattenHybridAction, check_hybrid_env
+from tests.algorithms import LAYOUTS, make_model
+from tests.hybrid_envs import LayoutEnv, box, layouts, make_layout_env
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_raw_env(algorithm, layout):
+    """The environment itself checks that every action it gets is in its action space."""
+    env = make_layout_env(layout)
+    model = make_model(algorithm, env).learn(30)
+    assert model.action_space == env.action_space
+    obs, _ = env.reset(seed=0)
+    for deterministic in (True, False):
+        action, state = model.predict(obs, deterministic=deterministic)
+        assert state is None and env.action_space.contains(action)
+        env.step(action)
+        env.step(model.policy.predict(obs, deterministic=deterministic)[0])
+    assert evaluate_policy(model, env, 2, warn=False)[0] is not None
+    evaluate_policy(model.policy, Monitor(env), 2)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("vec_env_cls, n_envs", [(DummyVecEnv, 4), (SubprocVecEnv, 1), (SubprocVecEnv, 4)])
+def test_vec_envs(algorithm, layout, vec_env_cls, n_envs):
+    if vec_env_cls is SubprocVecEnv and layout in ("flat", "shared", "product"):
+        pytest.skip("one tuple, one dict and one OneOf layout are enough for the slow subprocesses")
+    env_kwargs = dict(env_kwargs={"layout": layout}, vec_env_cls=vec_env_cls, seed=0)
+    vec_env = make_vec_env(make_layout_env, n_envs, **env_kwargs)
+    model = make_model(algorithm, vec_env).learn(40)
+    own_vec_env = make_vec_env(make_layout_env, n_envs, **env_kwargs)
+    obs = own_vec_env.reset()
+    actions = model.predict(obs)[0]
+    assert len(actions) == n_envs
+    own_vec_env.step(actions)
+    own_vec_env.close()
+    vec_env.close()
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_vec_wrappers(algorithm, layout):
+    wrappers = [VecNormalize, VecMonitor, lambda env: VecFrameStack(env, 2)]
+    if not isinstance(layouts()[layout], spaces.Dict):  # VecCheckNan refuses them
+        wrappers.append(lambda env: VecCheckNan(env, raise_exception=True))
+    for wrapper in wrappers:
+        env = wrapper(make_vec_env(make_layout_env, 2, env_kwargs={"layout": layout}))
+        model = make_model(algorithm, env).learn(30)
+        env.step(model.predict(env.reset())[0])
+
+
+@pytest.mark.parametrize("layout", ["nested", "dict", "one_of"])
+def test_callbacks(algorithm, layout, tmp_path):
+    env = VecNormalize(make_vec_env(make_layout_env, 1, env_kwargs={"layout": layout}))
+    eval_env = VecNormalize(make_vec_env(make_layout_env, 1, env_kwargs={"layout": layout}), training=False)
+    callbacks = [
+        EvalCallback(eval_env, n_eval_episodes=2, eval_freq=15, log_path=str(tmp_path), best_model_save_path=str(tmp_path)),
+        CheckpointCallback(20, str(tmp_path), save_replay_buffer=True, save_vecnormalize=True),
+    ]
+    make_model(algorithm, env).learn(45, callback=callbacks)
+    assert len(np.load(tmp_path / "evaluations.npz")["successes"]) == 3
+    algorithm.load(tmp_path / "best_model")
+    algorithm.load(tmp_path / "rl_model_40_steps", env=make_layout_env(layout))
+
+
+OBSERVATIONS = {
+    "MultiInputPolicy": spaces.Dict({"vector": box(-1, 1, 2), "image": spaces.Box(0, 255, (36, 36, 1), dtype=np.uint8)}),
+    "CnnPolicy": spaces.Box(0, 255, (36, 36, 1), dtype=np.uint8),
+}
+
+
+@pytest.mark.parametrize("policy", OBSERVATIONS)
+@pytest.mark.parametrize("share_features_extractor", [False, True])
+def test_dict_and_image_observations(algorithm, policy, share_features_extractor, tmp_path):
+    env = make_layout_env(observation_space=OBSERVATIONS[policy])
+    policy_kwargs = dict(net_arch=[8], share_features_extractor=share_features_extractor)
+    model = make_model(algorithm, env, policy, policy_kwargs=policy_kwargs, buffer_size=50)
+    before = {name: p.clone() for name, p in model.policy.named_parameters() if "features_extractor" in name}
+    model.learn(20)
+    after = dict(model.policy.named_parameters())
+    moved = {name.split(".")[0] for name, p in before.items() if (p != after[name]).any()}
+    assert before and moved >= {"critic", "critic_target", "actor", "actor_target"} - (
+        # A shared extractor is listed once, under its first owner
+        {name.split(".")[0] for name in ("actor", "actor_target", "critic", "critic_target")} - {n.split(".")[0] for n in before}
+    )
+    obs = env.reset(seed=0)[0]
+    action = model.predict(obs, deterministic=True)[0]
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model", buffer_size=1)
+    np.testing.assert_equal(loaded.predict(obs, deterministic=True)[0], action)
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        dict(train_freq=(1, "episode"), gradient_steps=-1),
+        dict(train_freq=(3, "step"), gradient_steps=2),
+        dict(n_steps=3),
+        dict(learning_rate=lambda progress: 1e-3 * progress),
+        dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False)),
+        dict(tensorboard_log="."),
+        dict(action_layout="per_action"),
+    ],
+    ids=str,
+)
+def test_training_options(algorithm, kwargs, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    model = make_model(algorithm, make_layout_env(), **kwargs).learn(40)
+    assert model._n_updates > 0 and model.num_timesteps >= 40
+    if "tensorboard_log" in kwargs:
+        assert list(tmp_path.glob(f"{algorithm.__name__}_1/events*"))
+    if "n_steps" in kwargs:
+        assert model.replay_buffer.sample(4).discounts is not None
+
+
+def test_progress_bar(algorithm):
+    pytest.importorskip("rich")
+    make_model(algorithm, make_layout_env()).learn(20, progress_bar=True)
+
+
+def test_env_by_id(algorithm):
+    model = make_model(algorithm, "Platform-v0").learn(30)
+    env = gym.make("Platform-v0")
+    obs, _ = env.reset()
+    env.step(model.predict(obs)[0])
+
+
+def test_success_rate_is_logged(algorithm):
+    model = make_model(algorithm, "HardMove4-v0")
+    model.learn(130, log_interval=1)
+    assert len(model.ep_success_buffer) > 0
+    model.dump_logs = lambda: None
+    model.learn(130, log_interval=1)
+    assert "rollout/exploration_rate" in model.logger.name_to_value
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_flattened_for_stock_algorithms(layout):
+    from stable_baselines3 import PPO, TD3
+
+    env = FlattenHybridAction(make_layout_env(layout))
+    check_hybrid_env(env.env)
+    for stock in (TD3, PPO):
+        kwargs = dict(learning_starts=10) if stock is TD3 else dict(n_steps=16, batch_size=16)
+        stock("MlpPolicy", env, policy_kwargs=dict(net_arch=[8]), **kwargs).learn(24)
+
+
+def test_flatten_takes_the_best_score_and_its_parameters():
+    env = FlattenHybridAction(make_layout_env("nested"))
+    k, parameters = env.action(np.array([0.1, 0.9, 0.2, -1, -0.5, 1.0]))
+    assert k == 1 and parameters[1] == pytest.approx(5.0)
+    k, parameters = env.action(np.array([0.9, 0.1, 0.2, -1, -0.5, 1.0]))
+    assert k == 0 and parameters[0].tolist() == [-1.0, -0.5]
+
+
+class BrokenEnv(LayoutEnv):
+    """Returns what it should not from the given step on."""
+
+    def __init__(self, broken, at=15):
+        super().__init__(layouts()["shared"], episode_length=1000)
+        self.broken, self.at, self.n = broken, at, 0
+
+    def step(self, action):
+        obs, reward, *rest = super().step(action)
+        self.n += 1
+        if self.n == self.at:
+            return (np.full_like(obs, np.nan), reward, *rest) if self.broken == "obs" else (obs, np.nan, *rest)
+        return obs, reward, *rest
+
+
+@pytest.mark.parametrize("broken, message", [("obs", "observation must be finite"), ("reward", "reward must be finite")])
+def test_nan_from_the_env(algorithm, broken, message):
+    model = make_model(algorithm, BrokenEnv(broken))
+    with pytest.raises(ValueError, match=message):
+        model.learn(40)
+    # Nothing is lost: 14 sound transitions are stored and the networks are finite
+    assert model.replay_buffer.size() == 14
+    assert all(np.isfinite(p.detach().numpy()).all() for p in model.policy.parameters())
+
+
+def test_bad_observations_for_predict(algorithm):
+    model = make_model(algorithm, make_layout_env())
+    with pytest.raises(ValueError, match="must be finite"):
+        model.predict(np.array([0.0, np.nan], dtype=np.float32))
+    with pytest.raises(ValueError, match="tuple"):
+        model.predict((np.zeros(2, dtype=np.float32), {}))
+
+
+def test_unknown_policy_kwargs(algorithm):
+    with pytest.raises(ValueError, match=r"unknown key\(s\) \['n_neurons'\].*net_arch"):
+        make_model(algorithm, make_layout_env(), policy_kwargs=dict(n_neurons=3))
+
+
+@pytest.mark.parametrize("space", [box(-1, 1, 2), spaces.Discrete(3)])
+def test_actions_that_are_not_hybrid(algorithm, space):
+    with pytest.raises(AssertionError, match="only supports"):
+        make_model(algorithm, LayoutEnv(space))
+
+
+def test_unbounded_parameters(algorithm):
+    with pytest.raises(ValueError, match="unbounded"):
+        make_model(algorithm, LayoutEnv(spaces.Tuple((spaces.Discrete(2), box(-np.inf, 1, 2)))))
+
+
+@pytest.mark.parametrize(
+    "kwargs, name",
+    [(dict(improvement_q="max"), "improvement_q"), (dict(beta_schedule="x"), "beta_schedule"),
+     (dict(n_diffusion_steps=0), "n_diffusion_steps"), (dict(latent_dim=0), "latent_dim")],
+)  # fmt: skip
+def test_bad_arguments_of_chdp(kwargs, name):
+    with pytest.raises(ValueError, match=name):
+        make_model(CHDP, make_layout_env(), **kwargs)

@@ -1,0 +1,112 @@
+"""Zips, replay buffers, resuming."""
+
+import io
+import zipfile
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import TD3
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_chdp import FlattenHybridAction
+from tests.algorithms import LAYOUTS, make_model
+from tests.hybrid_envs import make_layout_env
+
+OBS = np.random.default_rng(0).uniform(-1, 1, (20, 2)).astype(np.float32)
+
+
+def same_predictions(first, second):
+    np.testing.assert_equal(first.predict(OBS, deterministic=True)[0], second.predict(OBS, deterministic=True)[0])
+
+
+def optimizers(model):
+    names = [name for name in model._get_torch_save_params()[0] if name.endswith("optimizer")]
+    return [model.critic.optimizer if name.startswith("critic") else getattr(model.policy, name.split(".")[1]) for name in names]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_save_and_load(algorithm, layout, tmp_path):
+    model = make_model(algorithm, make_layout_env(layout)).learn(30)
+    model.save(tmp_path / "model")
+    same_predictions(model, algorithm.load(tmp_path / "model"))
+    loaded = algorithm.load(tmp_path / "model", env=make_vec_env(make_layout_env, 3, env_kwargs={"layout": layout}))
+    same_predictions(model, loaded)
+    loaded.learn(30)
+    for before, after in zip(optimizers(model), optimizers(algorithm.load(tmp_path / "model")), strict=True):
+        states = [list(optimizer.state_dict()["state"].values()) for optimizer in (before, after)]
+        assert len(states[0]) > 0
+        for mine, theirs in zip(*states, strict=True):
+            assert all(th.equal(th.as_tensor(mine[key]), th.as_tensor(theirs[key])) for key in mine)
+
+
+def test_zip_holds_no_network_twice(algorithm, tmp_path):
+    model = make_model(algorithm, make_layout_env()).learn(30)
+    model.save(tmp_path / "model")
+    with zipfile.ZipFile(tmp_path / "model.zip") as archive:
+        assert archive.getinfo("data").file_size < 40_000
+    buffer = io.BytesIO()
+    model.save(buffer)
+    buffer.seek(0)
+    same_predictions(model, algorithm.load(buffer))
+
+
+def test_set_parameters_and_policy_save(algorithm, tmp_path):
+    model = make_model(algorithm, make_layout_env()).learn(30)
+    other = make_model(algorithm, make_layout_env(), seed=5)
+    other.set_parameters(model.get_parameters())
+    same_predictions(model, other)
+    model.policy.save(tmp_path / "policy")
+    same_predictions(model.policy, type(model.policy).load(tmp_path / "policy"))
+
+
+def test_replay_buffer(algorithm, tmp_path):
+    model = make_model(algorithm, make_layout_env()).learn(30)
+    model.save_replay_buffer(tmp_path / "buffer")
+    other = make_model(algorithm, make_layout_env())
+    other.load_replay_buffer(tmp_path / "buffer")
+    assert other.replay_buffer.size() == model.replay_buffer.size()
+    np.testing.assert_array_equal(other.replay_buffer.actions, model.replay_buffer.actions)
+    other.learn(30, reset_num_timesteps=False)
+
+
+def test_continued_learning_equals_learning_at_once(algorithm):
+    runs = []
+    for parts in ((60,), (30, 30)):
+        model = make_model(algorithm, make_layout_env(), exploration_initial_eps=0.3, exploration_final_eps=0.3)
+        for part in parts:
+            model.learn(part, reset_num_timesteps=False)
+        assert model.num_timesteps == 60
+        runs.append([p.detach() for p in model.policy.parameters()])
+    assert all((a == b).all() for a, b in zip(*runs, strict=True))
+
+
+def test_set_env(algorithm):
+    model = make_model(algorithm, make_layout_env("nested")).learn(20)
+    model.set_env(make_layout_env("nested"))
+    model.learn(20)
+    with pytest.raises(ValueError, match="Action spaces do not match"):
+        model.set_env(make_layout_env("flat"))
+
+
+def test_vec_normalize_statistics(algorithm, tmp_path):
+    env = VecNormalize(make_vec_env(make_layout_env, 2))
+    model = make_model(algorithm, env).learn(40)
+    model.save(tmp_path / "model")
+    env.save(str(tmp_path / "statistics"))
+    restored = VecNormalize.load(str(tmp_path / "statistics"), make_vec_env(make_layout_env, 2))
+    algorithm.load(tmp_path / "model", env=restored).learn(20)
+
+
+def test_zip_of_another_algorithm(algorithm, tmp_path):
+    other = TD3("MlpPolicy", FlattenHybridAction(make_layout_env()), buffer_size=10)
+    other.save(tmp_path / "td3")
+    with pytest.raises(ValueError, match=f"td3 is not a {algorithm.__name__} model: its policy is .*TD3Policy"):
+        algorithm.load(tmp_path / "td3")
+
+
+def test_wrong_policy_kwargs_at_load(algorithm, tmp_path):
+    make_model(algorithm, make_layout_env()).save(tmp_path / "model")
+    with pytest.raises(ValueError, match="policy kwargs"):
+        algorithm.load(tmp_path / "model", policy_kwargs=dict(net_arch=[4]))
