@@ -1,6 +1,6 @@
 from pathlib import Path
 
-import sb3_chdp.envs  # registers the environments
+from sb3_chdp import envs  # registers the environments
 from sb3_chdp.chdp import CHDP
 from sb3_chdp.common.env_checker import check_hybrid_env
 from sb3_chdp.common.spaces import HybridActionSpec
@@ -8,4 +8,4 @@ from sb3_chdp.wrappers import FlattenHybridAction
 
 __version__ = Path(__file__).with_name("version.txt").read_text().strip()
 
-__all__ = ["CHDP", "FlattenHybridAction", "HybridActionSpec", "check_hybrid_env"]
+__all__ = ["CHDP", "FlattenHybridAction", "HybridActionSpec", "check_hybrid_env", "envs"]

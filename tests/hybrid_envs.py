@@ -34,9 +34,7 @@ class LayoutEnv(gym.Env):
     :param episode_length: steps of an episode, which ends by truncation
     """
 
-    def __init__(
-        self, action_space: spaces.Space, observation_space: spaces.Space | None = None, episode_length: int = 10
-    ):
+    def __init__(self, action_space: spaces.Space, observation_space: spaces.Space | None = None, episode_length: int = 10):
         self.action_space = action_space
         self.observation_space = observation_space or spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
         self.episode_length = episode_length

@@ -12,7 +12,12 @@ from sb3_chdp import HybridActionSpec, check_hybrid_env
 from sb3_chdp.envs import ENV_IDS
 from sb3_chdp.envs.point_mass import HardMoveEnv
 
-EDGES = [("Platform-v0", (0, [[np.nan]] * 3)), ("Platform-v0", (3, [[0.0]] * 3)), ("Goal-v0", (0, [[0.0]] * 3)), ("Goal-v0", 1)]
+EDGES = [
+    ("Platform-v0", (0, [[np.nan]] * 3)),
+    ("Platform-v0", (3, [[0.0]] * 3)),
+    ("Goal-v0", (0, [[0.0]] * 3)),
+    ("Goal-v0", 1),
+]
 
 
 def rollout(env, seed, n_steps=40):

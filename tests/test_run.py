@@ -21,6 +21,7 @@ from sb3_chdp import CHDP, FlattenHybridAction, check_hybrid_env
 from tests.algorithms import LAYOUTS, make_model
 from tests.hybrid_envs import LayoutEnv, box, layouts, make_layout_env
 
+
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_raw_env(algorithm, layout):
     """The environment itself checks that every action it gets is in its action space."""
@@ -97,7 +98,8 @@ def test_dict_and_image_observations(algorithm, policy, share_features_extractor
     moved = {name.split(".")[0] for name, p in before.items() if (p != after[name]).any()}
     assert before and moved >= {"critic", "critic_target", "actor", "actor_target"} - (
         # A shared extractor is listed once, under its first owner
-        {name.split(".")[0] for name in ("actor", "actor_target", "critic", "critic_target")} - {n.split(".")[0] for n in before}
+        {name.split(".")[0] for name in ("actor", "actor_target", "critic", "critic_target")}
+        - {n.split(".")[0] for n in before}
     )
     obs = env.reset(seed=0)[0]
     action = model.predict(obs, deterministic=True)[0]

@@ -23,7 +23,9 @@ def same_predictions(first, second):
 
 def optimizers(model):
     names = [name for name in model._get_torch_save_params()[0] if name.endswith("optimizer")]
-    return [model.critic.optimizer if name.startswith("critic") else getattr(model.policy, name.split(".")[1]) for name in names]
+    return [
+        model.critic.optimizer if name.startswith("critic") else getattr(model.policy, name.split(".")[1]) for name in names
+    ]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

@@ -13,7 +13,9 @@ from tests.hybrid_envs import box, layouts
 
 @st.composite
 def boxes(draw, min_size=0):
-    shape = draw(st.sampled_from([(0,), (), (1,), (2,), (2, 3), (3, 0)]) if min_size == 0 else st.sampled_from([(1,), (), (2, 2)]))
+    shape = draw(
+        st.sampled_from([(0,), (), (1,), (2,), (2, 3), (3, 0)]) if min_size == 0 else st.sampled_from([(1,), (), (2, 2)])
+    )
     dtype = draw(st.sampled_from([np.float32, np.float64, np.float16, np.int64, np.int32, np.uint8]))
     size = int(np.prod(shape))
     limits = (0, 255) if dtype is np.uint8 else (-1000, 1000)

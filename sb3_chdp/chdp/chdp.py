@@ -178,7 +178,9 @@ class CHDP(HybridOffPolicyAlgorithm):
         if improvement_q not in IMPROVEMENT_QS:
             raise ValueError(f"improvement_q must be one of {IMPROVEMENT_QS}, got {improvement_q!r}")
         for name, value in (
-            ("latent_dim", latent_dim), ("n_action_candidates", n_action_candidates), ("policy_delay", policy_delay)
+            ("latent_dim", latent_dim),
+            ("n_action_candidates", n_action_candidates),
+            ("policy_delay", policy_delay),
         ):
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")

@@ -1,6 +1,7 @@
 """Denoising diffusion over vectors in [-1, 1]. There is no reinforcement learning in this file."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch as th
@@ -32,7 +33,11 @@ def cosine_beta_schedule(n_steps: int, s: float = 0.008) -> np.ndarray:
     return np.clip(1 - alphas_cumprod[1:] / alphas_cumprod[:-1], 0, 0.999)
 
 
-BETA_SCHEDULES = {"vp": vp_beta_schedule, "linear": linear_beta_schedule, "cosine": cosine_beta_schedule}
+BETA_SCHEDULES: dict[str, Callable[[int], np.ndarray]] = {
+    "vp": vp_beta_schedule,
+    "linear": linear_beta_schedule,
+    "cosine": cosine_beta_schedule,
+}
 VARIANCE_TYPES = ("fixed_large", "fixed_small")
 
 
@@ -69,9 +74,7 @@ class NoiseSchedule:
         self.sqrt_recip_alphas_cumprod: list[float] = np.sqrt(1 / alphas_cumprod).tolist()
         self.sqrt_recipm1_alphas_cumprod: list[float] = np.sqrt(1 / alphas_cumprod - 1).tolist()
         self.posterior_mean_coef1: list[float] = (betas * np.sqrt(alphas_cumprod_prev) / (1 - alphas_cumprod)).tolist()
-        self.posterior_mean_coef2: list[float] = (
-            (1 - alphas_cumprod_prev) * np.sqrt(alphas) / (1 - alphas_cumprod)
-        ).tolist()
+        self.posterior_mean_coef2: list[float] = ((1 - alphas_cumprod_prev) * np.sqrt(alphas) / (1 - alphas_cumprod)).tolist()
         variance = betas if variance_type == "fixed_large" else posterior_variance
         self.sigmas: list[float] = np.sqrt(variance).tolist()
 
@@ -150,6 +153,8 @@ class DiffusionModel(nn.Module):
     :param variance_type: see :class:`NoiseSchedule`
     """
 
+    _levels: th.Tensor
+
     def __init__(
         self,
         dim: int,
@@ -194,9 +199,7 @@ class DiffusionModel(nn.Module):
             return th.randn((self.schedule.n_steps, n, self.dim), generator=generator).to(device)
         return th.randn((self.schedule.n_steps, n, self.dim), device=device)
 
-    def sample(
-        self, condition: th.Tensor, noise: th.Tensor | None = None, mask: th.Tensor | None = None
-    ) -> th.Tensor:
+    def sample(self, condition: th.Tensor, noise: th.Tensor | None = None, mask: th.Tensor | None = None) -> th.Tensor:
         """
         Run the whole reverse chain; gradients flow through it.
 
@@ -277,14 +280,12 @@ class DeterministicModel(nn.Module):
 
     def draw_noise(self, n: int, generator: th.Generator | None = None) -> th.Tensor:
         """:return: (n, dim) exploration noise for :meth:`sample`, 0 if a generator asks for a repeatable sample"""
-        device = self.mlp[0].weight.device
+        device = next(self.parameters()).device
         if generator is not None:
             return th.zeros((n, self.dim), device=device)
         return self.exploration_noise * th.randn((n, self.dim), device=device)
 
-    def sample(
-        self, condition: th.Tensor, noise: th.Tensor | None = None, mask: th.Tensor | None = None
-    ) -> th.Tensor:
+    def sample(self, condition: th.Tensor, noise: th.Tensor | None = None, mask: th.Tensor | None = None) -> th.Tensor:
         """See :meth:`DiffusionModel.sample`; the noise is (B, dim)."""
         if noise is None:
             noise = self.draw_noise(len(condition))

@@ -43,6 +43,7 @@ class CooperativeActor(BaseModel):
     :param normalize_images: whether to divide images by 255
     """
 
+    features_extractor: BaseFeaturesExtractor
     parameter_mask: th.Tensor
 
     def __init__(
@@ -64,7 +65,9 @@ class CooperativeActor(BaseModel):
         mask = action_space.spec.mask
         self._has_padding = not bool(mask.all())
         # Not needed when no action has padding, and then not kept: K may be 65,536
-        self.register_buffer("parameter_mask", th.tensor(mask if self._has_padding else mask[:1], dtype=th.float32), persistent=False)
+        self.register_buffer(
+            "parameter_mask", th.tensor(mask if self._has_padding else mask[:1], dtype=th.float32), persistent=False
+        )
 
     def features(self, obs: PyTorchObs) -> th.Tensor:
         """:return: (B, features_dim) features of the observations"""
@@ -125,6 +128,9 @@ class CHDPPolicy(HybridPolicy):
         the target critics acts
     :param exploration_noise: standard deviation of the exploration noise of policies without diffusion
     """
+
+    fixed_latent_noise: th.Tensor
+    fixed_parameter_noise: th.Tensor
 
     def __init__(
         self,
@@ -231,7 +237,7 @@ class CHDPPolicy(HybridPolicy):
             self.variance_type,
         )
 
-    def _make_optimizer(self, parameters: list[th.Tensor], lr_schedule: Schedule) -> th.optim.Optimizer:
+    def _make_optimizer(self, parameters: list[nn.Parameter], lr_schedule: Schedule) -> th.optim.Optimizer:
         return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
     def actor_features(self, obs: PyTorchObs) -> th.Tensor:
@@ -255,7 +261,10 @@ class CHDPPolicy(HybridPolicy):
         batch_size = features.shape[0]
         noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None)
         if deterministic:
-            noise = tuple(th.cat([fixed] * batch_size, dim=-2) for fixed in (self.fixed_latent_noise, self.fixed_parameter_noise))
+            noise = (
+                th.cat([self.fixed_latent_noise] * batch_size, dim=-2),
+                th.cat([self.fixed_parameter_noise] * batch_size, dim=-2),
+            )
         features = features.repeat_interleave(n_candidates, dim=0)
         latents, k, parameters = self.actor.sample(features, noise)
         rows = th.cat([k[:, None].float(), parameters, latents], dim=1)
@@ -325,23 +334,17 @@ MlpPolicy = CHDPPolicy
 
 class CnnPolicy(CHDPPolicy):
     """
-    :class:`CHDPPolicy` for images.
-
-    :param features_extractor_class: features extractor to use
+    :class:`CHDPPolicy` for images: ``features_extractor_class`` is :class:`NatureCNN` by default.
     """
 
-    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = NatureCNN, **kwargs: Any):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"features_extractor_class": NatureCNN, **kwargs})
 
 
 class MultiInputPolicy(CHDPPolicy):
     """
-    :class:`CHDPPolicy` for dict observations.
-
-    :param features_extractor_class: features extractor to use
+    :class:`CHDPPolicy` for dict observations: ``features_extractor_class`` is :class:`CombinedExtractor` by default.
     """
 
-    def __init__(
-        self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any
-    ):
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"features_extractor_class": CombinedExtractor, **kwargs})

@@ -115,9 +115,7 @@ class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
         )
         native_space, policy_kwargs = self.action_space, self.policy_kwargs
         hybrid_box = HybridBox(native_space, self.action_layout)
-        self.hybrid_space = HybridBox(
-            native_space, self.action_layout, self._latent_dim(hybrid_box.spec.n_discrete_actions)
-        )
+        self.hybrid_space = HybridBox(native_space, self.action_layout, self._latent_dim(hybrid_box.spec.n_discrete_actions))
         # Buffer and policy are built for the rows; the model keeps the user's space
         self.action_space = self.hybrid_space
         self.policy_kwargs = {**policy_kwargs, **self._network_kwargs()}
@@ -128,12 +126,12 @@ class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
         # set_random_seed() seeded the stand-in
         self.action_space.seed(None if self.seed is None else int(self.seed))
 
-    def _sample_action(
+    def _sample_action(  # type: ignore[override]  # a list of native actions
         self,
         learning_starts: int,
         action_noise: ActionNoise | None = None,
         n_envs: int = 1,
-    ) -> tuple[list[Any], np.ndarray]:  # type: ignore[override]
+    ) -> tuple[list[Any], np.ndarray]:
         """
         :param learning_starts: number of steps with uniformly random actions only
         :param action_noise: noise that is added to the scaled parameters of the policy's actions
@@ -184,7 +182,7 @@ class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
         return [*super()._excluded_save_params(), "hybrid_space"]
 
     @classmethod
-    def load(  # noqa: D102
+    def load(
         cls: type[SelfHybridOffPolicyAlgorithm],
         path: str | pathlib.Path | io.BufferedIOBase,
         env: GymEnv | None = None,
@@ -202,5 +200,3 @@ class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
         if not (isinstance(saved_class, type) and issubclass(saved_class, accepted)):
             raise ValueError(f"{path} is not a {cls.__name__} model: its policy is {saved_class}, not one of {accepted}")
         return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-
-

@@ -54,9 +54,7 @@ class HybridPolicy(BasePolicy):
         rows, vectorized_env = self._predict_rows(observation, deterministic)
         return rows if vectorized_env else rows[0]
 
-    def _predict_rows(
-        self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool
-    ) -> tuple[np.ndarray, bool]:
+    def _predict_rows(self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool) -> tuple[np.ndarray, bool]:
         self.set_training_mode(False)
         # Common mistake, see https://github.com/DLR-RM/stable-baselines3/issues/1694
         if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):

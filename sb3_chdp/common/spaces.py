@@ -113,7 +113,8 @@ class HybridActionSpec:
     ``Dict`` built from a plain mapping is the sorted order of its keys):
 
     * one box per action: ``Tuple(Discrete(K), Tuple(Box_1, ..., Box_K))``, ``Tuple(Discrete(K), Box_1, ..., Box_K)``,
-      ``OneOf((Box_1, ..., Box_K))``. An action without parameters is an empty ``Box``, ``Tuple`` or ``Dict``, or ``Discrete(1)``;
+      ``OneOf((Box_1, ..., Box_K))``. An action without parameters is an empty ``Box``, ``Tuple`` or ``Dict``, or
+      ``Discrete(1)``;
     * parameters shared by all actions: ``Tuple(Discrete(K), Box)``, and every product of several ``Discrete``,
       ``MultiDiscrete`` or ``MultiBinary`` leaves with ``Box`` leaves. The discrete leaves form one joint index
       (mixed radix, first leaf most significant).
@@ -136,7 +137,7 @@ class HybridActionSpec:
             if layout == "shared":
                 raise ValueError("action_layout='shared' does not apply to a OneOf space, whose parts exclude each other")
             self._discrete_leaves: list[_DiscreteLeaf] = []
-            options = [(("option",), option) for option in space.spaces]
+            options: list[tuple[Path, spaces.Space]] = [(("option",), option) for option in space.spaces]
             self.is_shared = False
         elif isinstance(space, (spaces.Tuple, spaces.Dict)):
             choice = None if layout == "shared" else self._find_options(space)
@@ -151,7 +152,9 @@ class HybridActionSpec:
                 discrete_space = _get(space, discrete_path)
                 self._discrete_leaves = [_DiscreteLeaf(discrete_path, discrete_space, *_digits(discrete_space))]
         else:
-            raise ValueError(f"The action space must be a Tuple, Dict or OneOf with a discrete and a continuous part, got {space}")
+            raise ValueError(
+                f"The action space must be a Tuple, Dict or OneOf with a discrete and a continuous part, got {space}"
+            )
 
         self._radices = tuple(radix for leaf in self._discrete_leaves for radix in leaf.radices)
         # Python integers: the product of many radices may overflow int64
@@ -159,12 +162,14 @@ class HybridActionSpec:
         for radix in self._radices:
             n_joint *= radix
         if n_joint > MAX_DISCRETE_ACTIONS:
-            raise ValueError(f"{n_joint} joint discrete actions are more than the {MAX_DISCRETE_ACTIONS} supported, in {space}")
+            raise ValueError(
+                f"{n_joint} joint discrete actions are more than the {MAX_DISCRETE_ACTIONS} supported, in {space}"
+            )
         self.n_discrete_actions = n_joint
         self._boxes = [self._collect_boxes(option, path) for path, option in options]
         if isinstance(space, spaces.OneOf):
             # The part of the native action behind the index lives under the key "option" while it is being built
-            self._templates = [{"option": self._template(option)} for option in space.spaces]
+            self._templates: list[Any] = [{"option": self._template(option)} for option in space.spaces]
         else:
             self._templates = [self._template(space)]
         self._build_tables()
@@ -180,7 +185,7 @@ class HybridActionSpec:
         for key, child in children:
             if not isinstance(child, spaces.Discrete):
                 continue
-            rest = [((other,), part) for other, part in children if other != key]
+            rest: list[tuple[Path, spaces.Space]] = [((other,), part) for other, part in children if other != key]
             candidates = [rest]
             if len(rest) == 1 and (inner := _children(rest[0][1])) is not None:
                 candidates.insert(0, [((*rest[0][0], name), part) for name, part in inner])
@@ -285,11 +290,11 @@ class HybridActionSpec:
 
     @staticmethod
     def _cast(values: np.ndarray, box: spaces.Box) -> np.ndarray:
-        """Reshape float64 values to a box; integers are rounded, and the result is inside the bounds in the box's own dtype."""
+        """Reshape float64 values to a box; integers are rounded, and the result is inside the bounds in the box's dtype."""
         if box.dtype.kind in "iu":
             values = np.rint(values)
             # The bounds of 64-bit integers are not floats: clip before the cast and after it
-            limits = np.iinfo(box.dtype)
+            limits = np.iinfo(box.dtype.name)
             values = np.clip(values, np.nextafter(float(limits.min), 0), np.nextafter(float(limits.max), 0))
         # asarray: clip makes scalars of 0-dimensional arrays
         return np.asarray(np.clip(values.reshape(box.shape).astype(box.dtype), box.low, box.high))
@@ -351,7 +356,8 @@ class HybridActionSpec:
         :return: (1 + Pmax,) float64 ``[k | scaled parameters]``, padding 0
         """
         if isinstance(self.space, spaces.OneOf):
-            k, action = int(action[0]), {"option": action[1]}
+            k = int(action[0])
+            action = {"option": action[1]}
         else:
             digits = [np.ravel(_get(action, leaf.path)) - leaf.start for leaf in self._discrete_leaves]
             k = int(np.ravel_multi_index(tuple(np.concatenate(digits).astype(np.int64)), self._radices))
@@ -393,9 +399,10 @@ class HybridBox(spaces.Box):
         super().__init__(low, high, dtype=np.float32)
 
     def __eq__(self, other: Any) -> bool:
-        return (
-            isinstance(other, HybridBox)
-            and (self.native, self.spec.layout, self.latent_dim) == (other.native, other.spec.layout, other.latent_dim)
+        return isinstance(other, HybridBox) and (self.native, self.spec.layout, self.latent_dim) == (
+            other.native,
+            other.spec.layout,
+            other.latent_dim,
         )
 
     def __reduce__(self) -> tuple[Any, ...]:

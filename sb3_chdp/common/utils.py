@@ -40,10 +40,14 @@ def check_policy_kwargs(policy_class: type, policy_kwargs: dict[str, Any]) -> No
     """
     :raises ValueError: if the policy has no such argument; the message lists those it has
     """
-    parameters = inspect.signature(policy_class).parameters
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
-        return
-    accepted = set(parameters) - {"observation_space", "action_space", "lr_schedule", "self"}
+    accepted: set[str] = set()
+    # A class that passes **kwargs on accepts what its parent does
+    for parent in policy_class.__mro__:
+        parameters = inspect.signature(parent).parameters.values()
+        accepted |= {p.name for p in parameters if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)}
+        if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+            break
+    accepted -= {"observation_space", "action_space", "lr_schedule", "self"}
     unknown = set(policy_kwargs) - accepted
     if unknown:
         raise ValueError(

@@ -20,7 +20,7 @@ class HybridEnv(gym.Env[np.ndarray, Any]):
     :param render_mode: None, "human" or "rgb_array"
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
     action_space: spaces.Tuple
     observation_space: spaces.Box
     #: size of the picture in pixels
@@ -55,7 +55,9 @@ class HybridEnv(gym.Env[np.ndarray, Any]):
             k = int(action[0])
             parameters = [float(value) for value in action[1][k]]
         except (TypeError, IndexError) as error:
-            raise ValueError(f"action must be (k, (parameters_0, ..., parameters_K-1)) as in action_space, got {action!r}") from error
+            raise ValueError(
+                f"action must be (k, (parameters_0, ..., parameters_K-1)) as in action_space, got {action!r}"
+            ) from error
         # A finite sum of finite numbers is the cheapest test: x - x is 0 only for finite x
         if k < 0 or len(parameters) != self._n_parameters[k] or any(value - value != 0.0 for value in parameters):
             raise ValueError(f"action must be in the action space; got k={k} with parameters {parameters}")

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from math import atan2, cos, hypot, pi, sin
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
@@ -143,7 +143,7 @@ class GoalEnv(HybridEnv):
     Version 0: transitions equal the original's, oddities included.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
     screen_size = (448, 600)
     state_names = tuple(
         [f"{who}_{what}" for who in ("player", "goalie") for what in ("x", "y", "vx", "vy", "orientation")]

@@ -1,6 +1,6 @@
 """Platform: a side-view platformer with three jumps and two enemies (Masson et al., 2016)."""
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
@@ -35,9 +35,7 @@ _PLATFORM_FEATURES = tuple(
 
 def is_standing(x: float, y: float) -> bool:
     """Whether the player's feet are exactly on one of the platforms."""
-    return y == GROUND and (
-        (-20.0 <= x <= 250.0) or (-20.0 <= x - 475.0 <= 275.0) or (-20.0 <= x - 985.0 <= 50.0)
-    )
+    return y == GROUND and ((-20.0 <= x <= 250.0) or (-20.0 <= x - 475.0 <= 275.0) or (-20.0 <= x - 985.0 <= 50.0))
 
 
 def separate(x: float, y: float, vx: float, vy: float) -> tuple[float, float, float, float]:
@@ -92,7 +90,7 @@ class PlatformEnv(HybridEnv):
     gym-platform. Version 0: transitions equal the original's; observations scaled as its wrappers do.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
     screen_size = (1035, 300)
     state_names = ("player_x", "player_y", "player_vx", "player_vy", "enemy1_x", "enemy1_dx", "enemy2_x", "enemy2_dx")
 

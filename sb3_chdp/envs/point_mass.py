@@ -34,7 +34,7 @@ class PointMassEnv(HybridEnv):
     :param render_mode: None, "human" or "rgb_array"
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
     screen_size = (700, 700)
     state_names: ClassVar[tuple[str, ...]] = ("agent_x", "agent_y", "agent_vx", "agent_vy", "target_x", "target_y")
 
@@ -54,7 +54,9 @@ class PointMassEnv(HybridEnv):
         super().reset(seed=seed)
         x, y, target_x, target_y = self.np_random.uniform(-1.0, 1.0, 4).tolist()
         self.x, self.y = (x, y) if self.start is None else map(float, self.start)
-        self.target_x, self.target_y = (target_x, target_y) if self.target_position is None else map(float, self.target_position)
+        self.target_x, self.target_y = (
+            (target_x, target_y) if self.target_position is None else map(float, self.target_position)
+        )
         self.vx = self.vy = 0.0
         self._force = (0.0, 0.0)
         if self.render_mode == "human":
@@ -181,7 +183,7 @@ def motion_table(n_actuators: int) -> np.ndarray:
     directions = np.round(np.stack([np.cos(angles), np.sin(angles)], axis=1), 3)
     subsets = (np.arange(2**n_actuators)[:, None] >> np.arange(n_actuators)[::-1]) & 1
     motions = subsets @ directions
-    motions /= np.linalg.norm(motions, axis=1).max()
+    motions = motions / np.linalg.norm(motions, axis=1).max()
     motions.setflags(write=False)
     return motions
 

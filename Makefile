@@ -1,0 +1,46 @@
+# `make train` and `make test` do everything on a machine with Python >= 3.10 and make.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+SOURCES := sb3_chdp tests benchmarks
+# Small networks are fastest on one thread
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: train test format lint type check-codestyle docs speed clean-env
+
+$(STAMP): setup.cfg pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .[zoo,render,plots,tests]
+	touch $(STAMP)
+
+train: $(STAMP)
+	$(BIN)/sb3-chdp train --env Platform-v0 --log-folder logs --progress --verbose 0 --eval-freq -1
+	$(BIN)/sb3-chdp enjoy --env Platform-v0 --folder logs --no-render --n-timesteps 1000 --verbose 0
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -n 2 --dist loadfile -q
+
+format: $(STAMP)
+	$(BIN)/ruff check --select I --fix $(SOURCES)
+	$(BIN)/black $(SOURCES)
+
+check-codestyle: $(STAMP)
+	$(BIN)/black --check $(SOURCES)
+
+lint: $(STAMP)
+	$(BIN)/ruff check $(SOURCES)
+
+type: $(STAMP)
+	$(BIN)/mypy sb3_chdp
+
+docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .[docs]
+	$(BIN)/mkdocs build --strict
+
+speed: $(STAMP)
+	$(BIN)/python benchmarks/speed.py
+
+clean-env:
+	rm -rf $(VENV)
