@@ -1,5 +1,7 @@
 # `make train` and `make test` do everything on a machine with Python >= 3.10 and make.
 PYTHON ?= python3
+SHELL := bash
+.SHELLFLAGS := -o pipefail -c
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
@@ -17,7 +19,7 @@ $(STAMP): setup.cfg pyproject.toml constraints.txt
 
 train: $(STAMP)
 	$(BIN)/sb3-chdp train --env Platform-v0 --log-folder logs --progress --verbose 0 --eval-freq -1
-	$(BIN)/sb3-chdp enjoy --env Platform-v0 --folder logs --no-render --n-timesteps 1000 --verbose 0
+	$(BIN)/sb3-chdp enjoy --env Platform-v0 --folder logs --no-render --n-timesteps 1000 | grep --invert-match "^Episode "
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadfile -q

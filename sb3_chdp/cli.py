@@ -5,7 +5,7 @@ The command ``sb3-chdp``: rl_zoo3's scripts with the algorithms and environments
     sb3-chdp optimize --env Goal-v0 --n-trials 50      tune hyperparameters with Optuna
     sb3-chdp enjoy --env Platform-v0 -f logs     watch a trained agent
     sb3-chdp record --env Platform-v0 -f logs    record a video of it
-    sb3-chdp plot --algo chdp --env Platform-v0 -f logs -y success     learning curves
+    sb3-chdp plot --env Platform-v0 -f logs -y success     learning curves
     sb3-chdp all_plots | plot_from_file | record_training   the other scripts of rl_zoo3
 """
 
@@ -24,7 +24,7 @@ SCRIPTS = {
     "plot_from_file": "rl_zoo3.plots.plot_from_file",
 }
 # Scripts for which one algorithm is named by --algo
-WITH_ALGO = ("train", "optimize", "enjoy", "record", "record_training")
+WITH_ALGO = ("train", "optimize", "enjoy", "record", "record_training", "plot")
 # What rl_zoo3 2.9.2 imports, declared by it or not
 REQUIRED = ("rl_zoo3", "requests", "pandas", "tensorboard")
 
@@ -47,7 +47,8 @@ def prepare_arguments(command: str, arguments: list[str]) -> list[str]:
     from sb3_chdp.zoo import HYPERPARAMS_FOLDER
 
     arguments = list(arguments)
-    if command in WITH_ALGO and _option(arguments, "--algo") is None:
+    short_name = ("-a",) if command == "plot" else ()
+    if command in WITH_ALGO and _option(arguments, "--algo", *short_name) is None:
         arguments = ["--algo", "chdp", *arguments]
     if command == "optimize" and not {"-optimize", "--optimize-hyperparameters"} & set(arguments):
         arguments.append("--optimize-hyperparameters")

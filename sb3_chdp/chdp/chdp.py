@@ -68,7 +68,8 @@ class CHDP(HybridOffPolicyAlgorithm):
         of the target critics is taken
     :param relabel_latents: whether a stored latent that does not decode to the stored discrete action any more is
         replaced by that action's present codeword
-    :param codebook_learning_rate: learning rate of the codebook, None for ``learning_rate``
+    :param codebook_learning_rate: learning rate of the codebook; at the rate of the policies it moves faster than the
+        critic can follow
     :param max_grad_norm: bound on the gradient norm of every network, None for none
     :param policy_delay: policies and targets are updated once every ``policy_delay`` critic updates
     :param diffusion: False replaces both diffusion policies by deterministic MLPs (ablation)
@@ -129,7 +130,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         improvement_q: str = "q1",
         n_action_candidates: int = 16,
         relabel_latents: bool = True,
-        codebook_learning_rate: float | Schedule | None = None,
+        codebook_learning_rate: float | Schedule = 1e-4,
         max_grad_norm: float | None = 1.0,
         policy_delay: int = 1,
         diffusion: bool = True,
@@ -220,8 +221,7 @@ class CHDP(HybridOffPolicyAlgorithm):
     def _setup_model(self) -> None:
         super()._setup_model()
         self._create_aliases()
-        rate = self.learning_rate if self.codebook_learning_rate is None else self.codebook_learning_rate
-        self.codebook_lr_schedule = FloatSchedule(rate)
+        self.codebook_lr_schedule = FloatSchedule(self.codebook_learning_rate)
         online, target = (self.actor, self.critic), (self.actor_target, self.critic_target)
         # The features extractor may be shared: a dict counts it once
         self._online_params = list(dict.fromkeys(p for net in online for p in net.parameters()))

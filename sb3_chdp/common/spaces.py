@@ -296,8 +296,9 @@ class HybridActionSpec:
             # The bounds of 64-bit integers are not floats: clip before the cast and after it
             limits = np.iinfo(box.dtype.name)
             values = np.clip(values, np.nextafter(float(limits.min), 0), np.nextafter(float(limits.max), 0))
-        # asarray: clip makes scalars of 0-dimensional arrays
-        return np.asarray(np.clip(values.reshape(box.shape).astype(box.dtype), box.low, box.high))
+        values = values.reshape(box.shape).astype(box.dtype)
+        # Faster than clip; asarray because ufuncs make scalars of 0-dimensional arrays
+        return np.asarray(np.minimum(np.maximum(values, box.low), box.high))
 
     def to_native(self, row: np.ndarray) -> Any:
         """
@@ -335,7 +336,8 @@ class HybridActionSpec:
         return native
 
     def _split_index(self, k: int) -> Iterator[np.ndarray]:
-        digits = np.array(np.unravel_index(k, self._radices))
+        # A single Discrete is by far the most common case
+        digits = np.array([k] if len(self._radices) == 1 else np.unravel_index(k, self._radices))
         offset = 0
         for leaf in self._discrete_leaves:
             yield digits[offset : offset + len(leaf.radices)]

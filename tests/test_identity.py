@@ -1,0 +1,49 @@
+"""Learning tests with budgets that a broken algorithm cannot meet."""
+
+import pytest
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from sb3_chdp import CHDP
+from tests.hybrid_envs import HybridIdentityEnv
+
+# Uniformly random actions succeed in 9 % of the episodes; a policy that gets the action right and always
+# chooses 0 for its parameter in 30 %, one that gets the parameter right and guesses the action in 33 %
+THRESHOLD = 0.8
+SETTINGS = {
+    CHDP: dict(n_diffusion_steps=5, gradient_steps=2, learning_starts=200, policy_kwargs=dict(net_arch=[64, 64])),
+}
+
+
+def success(model):
+    env = make_vec_env(HybridIdentityEnv, 8, seed=100)
+    return evaluate_policy(model, env, 200, deterministic=True)[0]
+
+
+@pytest.mark.slow
+def test_hybrid_identity(algorithm):
+    env = make_vec_env(HybridIdentityEnv, 8, seed=0)
+    model = algorithm("MlpPolicy", env, seed=0, gamma=0.0, **SETTINGS[algorithm])
+    model.learn(5000)
+    assert success(model) > THRESHOLD
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("broken", ["critic ignores the latents", "no policy improvement"])
+def test_broken_chdp_fails(broken):
+    """The threshold is out of reach without the parts that make the algorithm learn."""
+    settings = dict(SETTINGS[CHDP], n_action_candidates=1, eta=0.0 if broken == "no policy improvement" else 10.0)
+    model = CHDP("MlpPolicy", make_vec_env(HybridIdentityEnv, 8, seed=0), seed=0, gamma=0.0, **settings)
+    if broken == "critic ignores the latents":
+        n_features, latent_dim = 4, model.latent_dim
+        for critic in (model.critic, model.critic_target):
+            for q_net in critic.q_networks:
+                weight = q_net[0].weight
+                mask = th.ones_like(weight)
+                mask[:, n_features : n_features + latent_dim] = 0
+                weight.data *= mask
+                if weight.requires_grad:
+                    weight.register_hook(lambda gradient, mask=mask: gradient * mask)
+    model.learn(5000)
+    assert success(model) < THRESHOLD - 0.2

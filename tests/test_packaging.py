@@ -1,0 +1,35 @@
+"""The package installs as a wheel, with its data and without the tests."""
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import sb3_chdp
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_wheel(tmp_path):
+    subprocess.run(
+        [sys.executable, "-m", "build", "--wheel", "--outdir", str(tmp_path), str(ROOT)], check=True, capture_output=True
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        archive.extractall(tmp_path / "site")
+    assert {"sb3_chdp/py.typed", "sb3_chdp/version.txt", "sb3_chdp/hyperparams/chdp.yml"} <= set(names)
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"sb3_chdp"}, "nothing else, no tests"
+    # Used from the wheel: the version and the YAML files are found
+    code = "import sb3_chdp, sb3_chdp.zoo as z; print(sb3_chdp.__file__, sb3_chdp.__version__, (z.HYPERPARAMS_FOLDER / 'chdp.yml').is_file())"
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path / "site", check=True, capture_output=True, text=True
+    ).stdout.split()
+    assert result[-3:] == [str(tmp_path / "site" / "sb3_chdp" / "__init__.py"), sb3_chdp.__version__, "True"]
+
+
+def test_import_is_light():
+    """Importing the package imports neither rl_zoo3, which patches Gymnasium, nor pygame."""
+    code = "import sys, sb3_chdp; print([m for m in ('rl_zoo3', 'pygame', 'optuna', 'matplotlib.pyplot') if m in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert result.stdout.strip() == "[]"

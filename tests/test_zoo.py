@@ -1,0 +1,121 @@
+"""The command line, really run on tiny budgets."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from sb3_chdp.cli import SCRIPTS
+from sb3_chdp.envs import ENV_IDS
+
+pytest.importorskip("rl_zoo3")
+
+ENV_ID = "HardMove4-v0"
+TINY = ["-params", "n_envs:2", "learning_starts:20", "n_diffusion_steps:2", "batch_size:8", "buffer_size:500"]
+HYPERPARAMS = Path(__file__).parent.parent / "hyperparams"
+
+
+def run(*arguments, cwd, code=0):
+    environment = {**os.environ, "MPLBACKEND": "Agg", "SDL_VIDEODRIVER": "dummy", "OMP_NUM_THREADS": "1"}
+    result = subprocess.run(
+        [sys.executable, "-m", "sb3_chdp", *arguments], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert result.returncode == code, result.stdout + result.stderr
+    return result.stdout + result.stderr
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A folder in which ``sb3-chdp train`` ran."""
+    folder = tmp_path_factory.mktemp("zoo")
+    run(
+        "train", "--env", ENV_ID, "-n", "300", "--eval-freq", "100", "--eval-episodes", "2", "--n-eval-envs", "2",
+        "--save-freq", "100", "--save-replay-buffer", "-P", *TINY, cwd=folder,
+    )  # fmt: skip
+    return folder
+
+
+def test_train(trained):
+    folder = trained / "logs" / "chdp" / f"{ENV_ID}_1"
+    assert (folder / f"{ENV_ID}.zip").is_file() and (folder / "best_model.zip").is_file()
+    assert len(np.load(folder / "evaluations.npz")["successes"]) >= 2
+    config = dict(yaml.load((folder / ENV_ID / "config.yml").read_text(), Loader=yaml.UnsafeLoader))
+    assert config["gradient_steps"] == 2, "the YAML file of the package was used"
+
+
+def test_continue(trained):
+    model = Path("logs") / "chdp" / f"{ENV_ID}_1" / f"{ENV_ID}.zip"
+    run("train", "--algo", "chdp", "--env", ENV_ID, "-i", str(model), "-n", "100", "--eval-freq", "-1", "-f", "continued",
+        "--vec-env", "subproc", *TINY, cwd=trained)  # fmt: skip
+    assert (trained / "continued" / "chdp" / f"{ENV_ID}_1" / f"{ENV_ID}.zip").is_file()
+
+
+@pytest.mark.parametrize("which", [(), ("--load-best", "--n-envs", "2"), ("--load-last-checkpoint", "--stochastic")], ids=str)
+def test_enjoy(trained, which):
+    output = run("enjoy", "--env", ENV_ID, "-f", "logs", "--no-render", "-n", "150", *which, cwd=trained)
+    # rl_zoo3 counts episodes of a single environment only
+    assert "--n-envs" in which or ("Success rate" in output and "Mean reward" in output)
+
+
+def test_enjoy_renders(trained):
+    run("enjoy", "--env", ENV_ID, "-f", "logs", "-n", "5", cwd=trained)
+
+
+def test_plot(trained):
+    assert "No data" not in run("plot", "--env", ENV_ID, "-f", "logs", "-y", "success", "-w", "2", cwd=trained)
+    run("all_plots", "-a", "chdp", "-e", ENV_ID, "-f", "logs", "-k", "successes", "--no-display", "-o", "post", cwd=trained)
+
+
+def test_record(trained):
+    run("record", "--env", ENV_ID, "-f", "logs", "-n", "20", "-o", "videos", cwd=trained)
+    assert list((trained / "videos").glob("*.mp4"))
+
+
+def test_optimize_and_train_the_best_trial(trained):
+    study = ["--storage", "study.log", "--study-name", "s", "-f", "tuned"]
+    run("optimize", "--env", ENV_ID, "-n", "60", "--n-trials", "2", "--n-startup-trials", "1", "--n-evaluations", "1",
+        "--eval-episodes", "1", "--no-optim-plots", *study, cwd=trained)  # fmt: skip
+    run("train", "--env", ENV_ID, "-n", "60", "--eval-freq", "-1", "--trial-id", "1", *study, cwd=trained)
+
+
+def test_users_own_hyperparameters_win(trained):
+    (trained / "own.yml").write_text("default:\n  n_timesteps: 40\n  policy: MlpPolicy\n  latent_dim: 5\n")
+    output = run("train", "--env", ENV_ID, "-conf", "own.yml", "--eval-freq", "-1", "-f", "own", cwd=trained)
+    assert "latent_dim" in output
+
+
+def test_stock_algorithm_on_the_flattened_environment(trained):
+    (trained / "sac.yml").write_text(
+        "default:\n  n_timesteps: 120\n  policy: MlpPolicy\n  env_wrapper: sb3_chdp.wrappers.FlattenHybridAction\n"
+    )
+    run("train", "--algo", "sac", "--env", ENV_ID, "-conf", "sac.yml", "--eval-freq", "-1", "-f", "stock", cwd=trained)
+
+
+def test_help_and_unknown_command(tmp_path):
+    assert "sb3-chdp train" in run("--help", cwd=tmp_path)
+    message = run("trian", cwd=tmp_path, code=1)
+    assert "unknown command 'trian'" in message and all(script in message for script in SCRIPTS)
+
+
+def test_without_the_zoo_extra(tmp_path):
+    """One line says what to install."""
+    code = (
+        "import sys, importlib.util as u; find = u.find_spec;"
+        "u.find_spec = lambda name, *a: None if name == 'rl_zoo3' else find(name, *a);"
+        "sys.argv = ['sb3-chdp', 'train']; from sb3_chdp.cli import main; main()"
+    )
+    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert result.returncode == 1
+    assert result.stderr.strip() == "sb3-chdp train needs rl_zoo3: pip install 'sb3-chdp[zoo]'"
+
+
+@pytest.mark.parametrize("path", sorted(HYPERPARAMS.glob("*.yml")), ids=lambda path: path.name)
+def test_yaml_files_have_all_environments(path):
+    settings = yaml.safe_load(path.read_text())
+    assert set(settings) == {"default", *ENV_IDS}
+    for env_settings in settings.values():
+        assert {"n_timesteps", "policy"} <= set(env_settings)
