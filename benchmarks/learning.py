@@ -101,7 +101,8 @@ def run_cell(cell: tuple[str, int, argparse.Namespace]) -> str:
     hyperparams = {**settings.get(env_id, settings["default"]), **args.set}
     n_envs = hyperparams.pop("n_envs", 1)
     total = int(args.steps or hyperparams["n_timesteps"])
-    hyperparams.pop("n_timesteps", None)
+    for key in ("n_timesteps", "monitor_kwargs"):  # rl_zoo3's
+        hyperparams.pop(key, None)
     folder = Path(args.out) / env_id
     folder.mkdir(parents=True, exist_ok=True)
     path, meta_path = folder / f"seed_{seed}.csv", folder / f"seed_{seed}.json"
