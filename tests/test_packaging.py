@@ -21,7 +21,10 @@ def test_wheel(tmp_path):
     assert {"sb3_chdp/py.typed", "sb3_chdp/version.txt", "sb3_chdp/hyperparams/chdp.yml"} <= set(names)
     assert {name.split("/")[0].split("-")[0] for name in names} == {"sb3_chdp"}, "nothing else, no tests"
     # Used from the wheel: the version and the YAML files are found
-    code = "import sb3_chdp, sb3_chdp.zoo as z; print(sb3_chdp.__file__, sb3_chdp.__version__, (z.HYPERPARAMS_FOLDER / 'chdp.yml').is_file())"
+    code = (
+        "import sb3_chdp, sb3_chdp.zoo as zoo;"
+        "print(sb3_chdp.__file__, sb3_chdp.__version__, (zoo.HYPERPARAMS_FOLDER / 'chdp.yml').is_file())"
+    )
     result = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path / "site", check=True, capture_output=True, text=True
     ).stdout.split()

@@ -1,16 +1,27 @@
-"""Hybrid action spaces: the only module that knows how users spell them."""
+"""Hybrid action spaces: the only module, with ``space_tree``, that knows how users spell them."""
 
 from collections.abc import Iterator
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
+from sb3_chdp.common.space_tree import (
+    DiscreteLeaf,
+    Path,
+    cast_to_box,
+    collect_boxes,
+    collect_discrete,
+    digits_of,
+    find_options,
+    get_part,
+    replace_part,
+    template_action,
+)
+
 MAX_DISCRETE_ACTIONS = 65_536
 LAYOUTS = ("auto", "per_action", "shared")
-
-Path = tuple[Any, ...]
 
 
 class HybridAction(tuple):
@@ -28,81 +39,6 @@ class HybridAction(tuple):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return tuple, (tuple(self),)
-
-
-class _BoxLeaf(NamedTuple):
-    """A ``Box`` of the action space and the columns of the padded parameter vector that it occupies."""
-
-    path: Path
-    space: spaces.Box
-    columns: slice
-
-
-class _DiscreteLeaf(NamedTuple):
-    """A discrete leaf, its digits (one for ``Discrete``, one per element otherwise) and their offset."""
-
-    path: Path
-    space: spaces.Space
-    radices: tuple[int, ...]
-    start: np.ndarray
-
-
-def _children(space: spaces.Space) -> list[tuple[Any, spaces.Space]] | None:
-    """:return: (key, child) pairs of a ``Tuple`` or ``Dict``, None for a leaf."""
-    if isinstance(space, spaces.Tuple):
-        return list(enumerate(space.spaces))
-    if isinstance(space, spaces.Dict):
-        return list(space.spaces.items())
-    return None
-
-
-def _leaves(space: spaces.Space, path: Path = ()) -> Iterator[tuple[Path, spaces.Space]]:
-    children = _children(space)
-    if children is None:
-        yield path, space
-        return
-    for key, child in children:
-        yield from _leaves(child, (*path, key))
-
-
-def _is_empty_discrete(space: spaces.Space) -> bool:
-    return isinstance(space, spaces.Discrete) and space.n == 1
-
-
-def _is_parameter_space(space: spaces.Space) -> bool:
-    """Whether a subtree can be the parameters of one action: boxes only, ``Discrete(1)`` standing for none."""
-    return all(isinstance(leaf, spaces.Box) or _is_empty_discrete(leaf) for _, leaf in _leaves(space))
-
-
-def _name(path: Path) -> str:
-    return "action_space" + "".join(f"[{key!r}]" for key in path)
-
-
-def _get(action: Any, path: Path) -> Any:
-    for key in path:
-        action = action[key]
-    return action
-
-
-def _replace(action: Any, path: Path, value: Any) -> Any:
-    """:return: ``action`` with ``value`` at ``path``; only the containers on the way are copied."""
-    if not path:
-        return value
-    key, rest = path[0], path[1:]
-    container: Any = dict(action) if isinstance(action, dict) else list(action)
-    container[key] = _replace(action[key], rest, value)
-    return container if isinstance(action, dict) else tuple(container)
-
-
-def _digits(space: spaces.Space) -> tuple[tuple[int, ...], np.ndarray]:
-    """:return: the number of values of every digit of a discrete leaf, and the smallest value of each."""
-    if isinstance(space, spaces.Discrete):
-        return (int(space.n),), np.array([int(space.start)])
-    if isinstance(space, spaces.MultiDiscrete):
-        return tuple(int(n) for n in space.nvec.flat), np.asarray(space.start).flatten()
-    assert isinstance(space, spaces.MultiBinary)
-    size = int(np.prod(space.shape))
-    return (2,) * size, np.zeros(size, dtype=np.int64)
 
 
 class HybridActionSpec:
@@ -136,21 +72,21 @@ class HybridActionSpec:
         if isinstance(space, spaces.OneOf):
             if layout == "shared":
                 raise ValueError("action_layout='shared' does not apply to a OneOf space, whose parts exclude each other")
-            self._discrete_leaves: list[_DiscreteLeaf] = []
+            self._discrete_leaves: list[DiscreteLeaf] = []
             options: list[tuple[Path, spaces.Space]] = [(("option",), option) for option in space.spaces]
             self.is_shared = False
         elif isinstance(space, (spaces.Tuple, spaces.Dict)):
-            choice = None if layout == "shared" else self._find_options(space)
+            choice = None if layout == "shared" else find_options(space)
             if choice is None and layout == "per_action":
                 raise ValueError(f"action_layout='per_action' needs a Discrete(K) and exactly K parameter spaces, got {space}")
             self.is_shared = choice is None
             if choice is None:
-                self._discrete_leaves = self._collect_discrete(space)
+                self._discrete_leaves = collect_discrete(space)
                 options = [((), space)]
             else:
                 discrete_path, options = choice
-                discrete_space = _get(space, discrete_path)
-                self._discrete_leaves = [_DiscreteLeaf(discrete_path, discrete_space, *_digits(discrete_space))]
+                discrete_space = get_part(space, discrete_path)
+                self._discrete_leaves = [DiscreteLeaf(discrete_path, discrete_space, *digits_of(discrete_space))]
         else:
             raise ValueError(
                 f"The action space must be a Tuple, Dict or OneOf with a discrete and a continuous part, got {space}"
@@ -166,93 +102,13 @@ class HybridActionSpec:
                 f"{n_joint} joint discrete actions are more than the {MAX_DISCRETE_ACTIONS} supported, in {space}"
             )
         self.n_discrete_actions = n_joint
-        self._boxes = [self._collect_boxes(option, path) for path, option in options]
+        self._boxes = [collect_boxes(option, path) for path, option in options]
         if isinstance(space, spaces.OneOf):
             # The part of the native action behind the index lives under the key "option" while it is being built
-            self._templates: list[Any] = [{"option": self._template(option)} for option in space.spaces]
+            self._templates: list[Any] = [{"option": template_action(option)} for option in space.spaces]
         else:
-            self._templates = [self._template(space)]
+            self._templates = [template_action(space)]
         self._build_tables()
-
-    @staticmethod
-    def _find_options(space: spaces.Space) -> tuple[Path, list[tuple[Path, spaces.Space]]] | None:
-        """
-        Look for a ``Discrete(K)`` next to K parameter spaces, flat or gathered in one container.
-
-        :return: path of the discrete leaf and (path, space) of the K options, None if there is no such reading
-        """
-        children = _children(space) or []
-        for key, child in children:
-            if not isinstance(child, spaces.Discrete):
-                continue
-            rest: list[tuple[Path, spaces.Space]] = [((other,), part) for other, part in children if other != key]
-            candidates = [rest]
-            if len(rest) == 1 and (inner := _children(rest[0][1])) is not None:
-                candidates.insert(0, [((*rest[0][0], name), part) for name, part in inner])
-            for options in candidates:
-                if len(options) == child.n and all(_is_parameter_space(part) for _, part in options):
-                    return (key,), options
-        return None
-
-    @staticmethod
-    def _collect_discrete(space: spaces.Space) -> list[_DiscreteLeaf]:
-        leaves = []
-        for path, leaf in _leaves(space):
-            if isinstance(leaf, (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
-                leaves.append(_DiscreteLeaf(path, leaf, *_digits(leaf)))
-            elif not isinstance(leaf, spaces.Box):
-                raise ValueError(
-                    f"{_name(path)} is a {type(leaf).__name__}; a hybrid action is made of Discrete, MultiDiscrete, "
-                    "MultiBinary and Box parts"
-                )
-        if not leaves:
-            raise ValueError(f"{space} has no discrete part: use an algorithm for Box actions, e.g. SAC or TD3")
-        return leaves
-
-    @staticmethod
-    def _collect_boxes(space: spaces.Space, prefix: Path) -> list[_BoxLeaf]:
-        boxes: list[_BoxLeaf] = []
-        offset = 0
-        for path, leaf in _leaves(space, prefix):
-            if not isinstance(leaf, spaces.Box):
-                if prefix == ("option",) and not _is_empty_discrete(leaf):
-                    raise ValueError(f"A part of a OneOf action space must hold Box spaces only, got {leaf}")
-                continue
-            if leaf.dtype.kind not in "fiu":
-                raise ValueError(f"{_name(path)} has dtype {leaf.dtype}; use a floating or integer Box")
-            if not (np.isfinite(leaf.low).all() and np.isfinite(leaf.high).all()):
-                raise ValueError(
-                    f"{_name(path)} is unbounded or has NaN bounds ({leaf}); give it finite bounds, "
-                    "for example with gymnasium.wrappers.TransformAction"
-                )
-            size = int(np.prod(leaf.shape))
-            boxes.append(_BoxLeaf(path, leaf, slice(offset, offset + size)))
-            offset += size
-        return boxes
-
-    @classmethod
-    def _template(cls, space: spaces.Space) -> Any:
-        """:return: a native action with every box at the middle of its bounds, to be filled in by ``to_native``"""
-        cache: dict[Any, np.ndarray] = {}
-
-        def build(part: spaces.Space) -> Any:
-            if isinstance(part, spaces.Tuple):
-                return tuple(build(child) for child in part.spaces)
-            if isinstance(part, spaces.Dict):
-                return {key: build(child) for key, child in part.spaces.items()}
-            if isinstance(part, spaces.Discrete):
-                return part.dtype.type(part.start)
-            if not isinstance(part, spaces.Box):
-                return None
-            # Equal boxes share one array: cheap to hold and, in subprocesses, to pickle
-            key = (part.shape, part.dtype, part.low.tobytes(), part.high.tobytes())
-            if key not in cache:
-                middle = 0.5 * part.low.astype(np.float64) + 0.5 * part.high.astype(np.float64)
-                cache[key] = cls._cast(middle, part)
-                cache[key].setflags(write=False)
-            return cache[key]
-
-        return build(space)
 
     def _build_tables(self) -> None:
         """Fill the (K, Pmax) tables: mask, centre and half range of every parameter, column in the concatenated vector."""
@@ -288,18 +144,6 @@ class HybridActionSpec:
         """(K,) number of parameters of every discrete action"""
         return self.mask.sum(axis=1)
 
-    @staticmethod
-    def _cast(values: np.ndarray, box: spaces.Box) -> np.ndarray:
-        """Reshape float64 values to a box; integers are rounded, and the result is inside the bounds in the box's dtype."""
-        if box.dtype.kind in "iu":
-            values = np.rint(values)
-            # The bounds of 64-bit integers are not floats: clip before the cast and after it
-            limits = np.iinfo(box.dtype.name)
-            values = np.clip(values, np.nextafter(float(limits.min), 0), np.nextafter(float(limits.max), 0))
-        values = values.reshape(box.shape).astype(box.dtype)
-        # Faster than clip; asarray because ufuncs make scalars of 0-dimensional arrays
-        return np.asarray(np.minimum(np.maximum(values, box.low), box.high))
-
     def to_native(self, row: np.ndarray) -> Any:
         """
         :param row: (1 + Pmax,) ``[k | scaled parameters]``; parameters are clipped to [-1, 1], padding is ignored
@@ -324,12 +168,12 @@ class HybridActionSpec:
         option = 0 if self.is_shared else k
         native = self._templates[option if isinstance(self.space, spaces.OneOf) else 0]
         for box in self._boxes[option]:
-            native = _replace(native, box.path, self._cast(values[box.columns], box.space))
+            native = replace_part(native, box.path, cast_to_box(values[box.columns], box.space))
         if isinstance(self.space, spaces.OneOf):
             native = (np.int64(k), native["option"])
         else:
             for leaf, digits in zip(self._discrete_leaves, self._split_index(k), strict=True):
-                native = _replace(native, leaf.path, self._native_digits(leaf, digits))
+                native = replace_part(native, leaf.path, self._native_digits(leaf, digits))
         if isinstance(native, tuple):
             native = HybridAction(native)
             native.row = row
@@ -344,7 +188,7 @@ class HybridActionSpec:
             offset += len(leaf.radices)
 
     @staticmethod
-    def _native_digits(leaf: _DiscreteLeaf, digits: np.ndarray) -> Any:
+    def _native_digits(leaf: DiscreteLeaf, digits: np.ndarray) -> Any:
         values = digits + leaf.start
         if isinstance(leaf.space, spaces.Discrete):
             return leaf.space.dtype.type(values[0])
@@ -361,12 +205,12 @@ class HybridActionSpec:
             k = int(action[0])
             action = {"option": action[1]}
         else:
-            digits = [np.ravel(_get(action, leaf.path)) - leaf.start for leaf in self._discrete_leaves]
+            digits = [np.ravel(get_part(action, leaf.path)) - leaf.start for leaf in self._discrete_leaves]
             k = int(np.ravel_multi_index(tuple(np.concatenate(digits).astype(np.int64)), self._radices))
         row = np.zeros(self.row_size)
         row[0] = k
         for box in self._boxes[0 if self.is_shared else k]:
-            values = np.ravel(_get(action, box.path)).astype(np.float64) - self._centre[k, box.columns]
+            values = np.ravel(get_part(action, box.path)).astype(np.float64) - self._centre[k, box.columns]
             half = self._half[k, box.columns]
             row[1:][box.columns] = np.divide(values, half, out=np.zeros_like(values), where=half > 0)
         return row

@@ -16,7 +16,7 @@ ENV_IDS = (
 # Goal's limit of 100 steps belongs to its dynamics: it is a termination
 gym.register("Platform-v0", entry_point="sb3_chdp.envs.platform:PlatformEnv", max_episode_steps=200)
 gym.register("Goal-v0", entry_point="sb3_chdp.envs.goal:GoalEnv")
-gym.register("HardGoal-v0", entry_point="sb3_chdp.envs.goal:HardGoalEnv")
+gym.register("HardGoal-v0", entry_point="sb3_chdp.envs.hard_goal:HardGoalEnv")
 gym.register("CatchPoint-v0", entry_point="sb3_chdp.envs.point_mass:CatchPointEnv", max_episode_steps=25)
 gym.register("HardMove-v0", entry_point="sb3_chdp.envs.point_mass:HardMoveEnv", max_episode_steps=30)
 for n_actuators in (4, 6, 8, 10):

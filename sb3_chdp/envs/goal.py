@@ -1,4 +1,4 @@
-"""Goal and Hard Goal: one attacker, one keeper, half a soccer pitch (Masson et al., 2016; Li et al., 2022)."""
+"""Goal: one attacker, one keeper, half a soccer pitch (Masson et al., 2016)."""
 
 from collections.abc import Iterator
 from math import atan2, cos, hypot, pi, sin
@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
 PITCH_LENGTH, PITCH_HALF_WIDTH = 20.0, 15.0
 GOAL_HALF_WIDTH, GOAL_DEPTH = 7.01, 2.44
-# The bound with which the original scales the height of a shot
-FLOAT32_GOAL_HALF_WIDTH = float(np.float32(GOAL_HALF_WIDTH))
 AREA_DEPTH, AREA_HALF_WIDTH = 5.5, 9.16
 PLAYER_RADIUS, BALL_RADIUS = 0.9, 0.4
 KICKABLE, CATCHABLE = 1.6, 2.0
@@ -327,33 +325,3 @@ class GoalEnv(HybridEnv):
             nose = at(body.x + body.radius * cos(body.heading), body.y + body.radius * sin(body.heading))
             canvas.line(centre, nose, (0, 0, 0), 2)
         canvas.disc(at(self.ball.x, self.ball.y), BALL_RADIUS * unit, (0, 0, 0))
-
-
-class HardGoalEnv(GoalEnv):
-    """
-    Goal with ten shoot actions, each aiming at one of five segments of the goal mouth (twice the same five).
-
-    ## Action space
-    `Tuple(Discrete(11), Tuple(Box([0, -15], [40, 15]), Box(-1, 1), ..., Box(-1, 1)))`: 0 is Goal's kick-to; 1 to 5 and 6 to
-    10 shoot, the parameter moves the aim within the action's segment, from its upper end at -1 to its lower end at 1.
-
-    ## Arguments
-    `fixed_intervals=True` makes the third segment [-0.2, 0.2] of the mouth. By default it is the single point 0.2, as in
-    all published scripts, so that actions 3 and 8 ignore their parameter.
-
-    ## Source
-    Li et al. (2022), "HyAR: Addressing Discrete-Continuous Action RL via Hybrid Action Representation". All else is Goal's.
-    """
-
-    def __init__(self, fixed_intervals: bool = False, noise: bool = True, render_mode: str | None = None):
-        super().__init__(noise, render_mode)
-        self._set_action_space([list(PARAMETER_BOUNDS[KICK_TO])] + [[(-1.0, 1.0)]] * 10)
-        middle = (-0.2, 0.2) if fixed_intervals else (0.2, 0.2)
-        self.intervals = ((-1.0, -0.6), (-0.6, -0.2), middle, (0.2, 0.6), (0.6, 1.0))
-
-    def _to_goal_action(self, k: int, parameters: list[float]) -> tuple[int, list[float]]:
-        if k == KICK_TO:
-            return KICK_TO, parameters
-        low, high = self.intervals[(k - 1) % 5]
-        scaled = (low + high) / 2 - parameters[0] * (high - low) / 2
-        return (SHOOT_LEFT if k <= 5 else SHOOT_RIGHT), [FLOAT32_GOAL_HALF_WIDTH * scaled]

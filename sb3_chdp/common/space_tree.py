@@ -1,0 +1,177 @@
+"""Reading nested action spaces and putting native actions together, part by part."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+
+# Keys that lead from the action space, or a native action, to one of its parts
+Path = tuple[Any, ...]
+
+
+class BoxLeaf(NamedTuple):
+    """A ``Box`` of the action space and the columns of the padded parameter vector that it occupies."""
+
+    path: Path
+    space: spaces.Box
+    columns: slice
+
+
+class DiscreteLeaf(NamedTuple):
+    """A discrete leaf, its digits (one for ``Discrete``, one per element otherwise) and their offset."""
+
+    path: Path
+    space: spaces.Space
+    radices: tuple[int, ...]
+    start: np.ndarray
+
+
+def children_of(space: spaces.Space) -> list[tuple[Any, spaces.Space]] | None:
+    """:return: (key, child) pairs of a ``Tuple`` or ``Dict``, None for a leaf."""
+    if isinstance(space, spaces.Tuple):
+        return list(enumerate(space.spaces))
+    if isinstance(space, spaces.Dict):
+        return list(space.spaces.items())
+    return None
+
+
+def leaves_of(space: spaces.Space, path: Path = ()) -> Iterator[tuple[Path, spaces.Space]]:
+    children = children_of(space)
+    if children is None:
+        yield path, space
+        return
+    for key, child in children:
+        yield from leaves_of(child, (*path, key))
+
+
+def is_empty_discrete(space: spaces.Space) -> bool:
+    return isinstance(space, spaces.Discrete) and space.n == 1
+
+
+def is_parameter_space(space: spaces.Space) -> bool:
+    """Whether a subtree can be the parameters of one action: boxes only, ``Discrete(1)`` standing for none."""
+    return all(isinstance(leaf, spaces.Box) or is_empty_discrete(leaf) for _, leaf in leaves_of(space))
+
+
+def name_of(path: Path) -> str:
+    return "action_space" + "".join(f"[{key!r}]" for key in path)
+
+
+def get_part(action: Any, path: Path) -> Any:
+    for key in path:
+        action = action[key]
+    return action
+
+
+def replace_part(action: Any, path: Path, value: Any) -> Any:
+    """:return: ``action`` with ``value`` at ``path``; only the containers on the way are copied."""
+    if not path:
+        return value
+    key, rest = path[0], path[1:]
+    container: Any = dict(action) if isinstance(action, dict) else list(action)
+    container[key] = replace_part(action[key], rest, value)
+    return container if isinstance(action, dict) else tuple(container)
+
+
+def digits_of(space: spaces.Space) -> tuple[tuple[int, ...], np.ndarray]:
+    """:return: the number of values of every digit of a discrete leaf, and the smallest value of each."""
+    if isinstance(space, spaces.Discrete):
+        return (int(space.n),), np.array([int(space.start)])
+    if isinstance(space, spaces.MultiDiscrete):
+        return tuple(int(n) for n in space.nvec.flat), np.asarray(space.start).flatten()
+    assert isinstance(space, spaces.MultiBinary)
+    size = int(np.prod(space.shape))
+    return (2,) * size, np.zeros(size, dtype=np.int64)
+
+
+def find_options(space: spaces.Space) -> tuple[Path, list[tuple[Path, spaces.Space]]] | None:
+    """
+    Look for a ``Discrete(K)`` next to K parameter spaces, flat or gathered in one container.
+
+    :return: path of the discrete leaf and (path, space) of the K options, None if there is no such reading
+    """
+    children = children_of(space) or []
+    for key, child in children:
+        if not isinstance(child, spaces.Discrete):
+            continue
+        rest: list[tuple[Path, spaces.Space]] = [((other,), part) for other, part in children if other != key]
+        candidates = [rest]
+        if len(rest) == 1 and (inner := children_of(rest[0][1])) is not None:
+            candidates.insert(0, [((*rest[0][0], name), part) for name, part in inner])
+        for options in candidates:
+            if len(options) == child.n and all(is_parameter_space(part) for _, part in options):
+                return (key,), options
+    return None
+
+
+def collect_discrete(space: spaces.Space) -> list[DiscreteLeaf]:
+    leaves = []
+    for path, leaf in leaves_of(space):
+        if isinstance(leaf, (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
+            leaves.append(DiscreteLeaf(path, leaf, *digits_of(leaf)))
+        elif not isinstance(leaf, spaces.Box):
+            raise ValueError(
+                f"{name_of(path)} is a {type(leaf).__name__}; a hybrid action is made of Discrete, MultiDiscrete, "
+                "MultiBinary and Box parts"
+            )
+    if not leaves:
+        raise ValueError(f"{space} has no discrete part: use an algorithm for Box actions, e.g. SAC or TD3")
+    return leaves
+
+
+def collect_boxes(space: spaces.Space, prefix: Path) -> list[BoxLeaf]:
+    boxes: list[BoxLeaf] = []
+    offset = 0
+    for path, leaf in leaves_of(space, prefix):
+        if not isinstance(leaf, spaces.Box):
+            if prefix == ("option",) and not is_empty_discrete(leaf):
+                raise ValueError(f"A part of a OneOf action space must hold Box spaces only, got {leaf}")
+            continue
+        if leaf.dtype.kind not in "fiu":
+            raise ValueError(f"{name_of(path)} has dtype {leaf.dtype}; use a floating or integer Box")
+        if not (np.isfinite(leaf.low).all() and np.isfinite(leaf.high).all()):
+            raise ValueError(
+                f"{name_of(path)} is unbounded or has NaN bounds ({leaf}); give it finite bounds, "
+                "for example with gymnasium.wrappers.TransformAction"
+            )
+        size = int(np.prod(leaf.shape))
+        boxes.append(BoxLeaf(path, leaf, slice(offset, offset + size)))
+        offset += size
+    return boxes
+
+
+def template_action(space: spaces.Space) -> Any:
+    """:return: a native action with every box at the middle of its bounds, to be filled in by ``to_native``"""
+    cache: dict[Any, np.ndarray] = {}
+
+    def build(part: spaces.Space) -> Any:
+        if isinstance(part, spaces.Tuple):
+            return tuple(build(child) for child in part.spaces)
+        if isinstance(part, spaces.Dict):
+            return {key: build(child) for key, child in part.spaces.items()}
+        if isinstance(part, spaces.Discrete):
+            return part.dtype.type(part.start)
+        if not isinstance(part, spaces.Box):
+            return None
+        # Equal boxes share one array: cheap to hold and, in subprocesses, to pickle
+        key = (part.shape, part.dtype, part.low.tobytes(), part.high.tobytes())
+        if key not in cache:
+            middle = 0.5 * part.low.astype(np.float64) + 0.5 * part.high.astype(np.float64)
+            cache[key] = cast_to_box(middle, part)
+            cache[key].setflags(write=False)
+        return cache[key]
+
+    return build(space)
+
+
+def cast_to_box(values: np.ndarray, box: spaces.Box) -> np.ndarray:
+    """Reshape float64 values to a box; integers are rounded, and the result is inside the bounds in the box's dtype."""
+    if box.dtype.kind in "iu":
+        values = np.rint(values)
+        # The bounds of 64-bit integers are not floats: clip before the cast and after it
+        limits = np.iinfo(box.dtype.name)
+        values = np.clip(values, np.nextafter(float(limits.min), 0), np.nextafter(float(limits.max), 0))
+    values = values.reshape(box.shape).astype(box.dtype)
+    # Faster than clip; asarray because ufuncs make scalars of 0-dimensional arrays
+    return np.asarray(np.minimum(np.maximum(values, box.low), box.high))
