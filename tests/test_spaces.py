@@ -138,6 +138,7 @@ def test_ambiguous_space_and_override():
     [
         (spaces.Tuple((spaces.Discrete(2), box(-np.inf, np.inf, 1))), r"action_space\[1\] is unbounded"),
         (spaces.Dict({"k": spaces.Discrete(2), "v": box(0, np.inf, 1)}), r"action_space\['v'\] is unbounded"),
+        (spaces.OneOf((box(0, 1, 1), box(0, np.inf, 1))), r"action_space.spaces\[1\] is unbounded"),
         (spaces.Tuple((box(0, 1, 1), box(0, 1, 1))), "no discrete part"),
         (spaces.Tuple((spaces.Discrete(2), spaces.Discrete(3))), "no continuous part"),
         (spaces.Tuple((spaces.Discrete(2), box(0, 1, 0))), "no continuous part"),

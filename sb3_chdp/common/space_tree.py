@@ -54,8 +54,8 @@ def is_parameter_space(space: spaces.Space) -> bool:
     return all(isinstance(leaf, spaces.Box) or is_empty_discrete(leaf) for _, leaf in leaves_of(space))
 
 
-def name_of(path: Path) -> str:
-    return "action_space" + "".join(f"[{key!r}]" for key in path)
+def name_of(path: Path, root: str = "action_space") -> str:
+    return root + "".join(f"[{key!r}]" for key in path)
 
 
 def get_part(action: Any, path: Path) -> Any:
@@ -106,6 +106,11 @@ def find_options(space: spaces.Space) -> tuple[Path, list[tuple[Path, spaces.Spa
 
 
 def collect_discrete(space: spaces.Space) -> list[DiscreteLeaf]:
+    """
+    :param space: an action space whose boxes serve all actions
+    :return: its discrete leaves
+    :raises ValueError: if there is none, or a leaf is neither discrete nor a box
+    """
     leaves = []
     for path, leaf in leaves_of(space):
         if isinstance(leaf, (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
@@ -120,19 +125,25 @@ def collect_discrete(space: spaces.Space) -> list[DiscreteLeaf]:
     return leaves
 
 
-def collect_boxes(space: spaces.Space, prefix: Path) -> list[BoxLeaf]:
+def collect_boxes(space: spaces.Space, prefix: Path, name: str | None = None) -> list[BoxLeaf]:
+    """
+    :param space: the parameters of one action, or of all
+    :param prefix: path of ``space`` in the native action
+    :param name: what to call ``space`` in messages, from its path if None
+    :return: its boxes, with consecutive columns of the parameter vector
+    :raises ValueError: for boxes that are unbounded or not numeric
+    """
     boxes: list[BoxLeaf] = []
     offset = 0
     for path, leaf in leaves_of(space, prefix):
+        leaf_name = name_of(path[len(prefix) :], name or name_of(prefix))
         if not isinstance(leaf, spaces.Box):
-            if prefix == ("option",) and not is_empty_discrete(leaf):
-                raise ValueError(f"A part of a OneOf action space must hold Box spaces only, got {leaf}")
             continue
         if leaf.dtype.kind not in "fiu":
-            raise ValueError(f"{name_of(path)} has dtype {leaf.dtype}; use a floating or integer Box")
+            raise ValueError(f"{leaf_name} has dtype {leaf.dtype}; use a floating or integer Box")
         if not (np.isfinite(leaf.low).all() and np.isfinite(leaf.high).all()):
             raise ValueError(
-                f"{name_of(path)} is unbounded or has NaN bounds ({leaf}); give it finite bounds, "
+                f"{leaf_name} is unbounded or has NaN bounds ({leaf}); give it finite bounds, "
                 "for example with gymnasium.wrappers.TransformAction"
             )
         size = int(np.prod(leaf.shape))

@@ -16,6 +16,7 @@ from sb3_chdp.common.space_tree import (
     digits_of,
     find_options,
     get_part,
+    is_parameter_space,
     replace_part,
     template_action,
 )
@@ -72,6 +73,9 @@ class HybridActionSpec:
         if isinstance(space, spaces.OneOf):
             if layout == "shared":
                 raise ValueError("action_layout='shared' does not apply to a OneOf space, whose parts exclude each other")
+            for i, option in enumerate(space.spaces):
+                if not is_parameter_space(option):
+                    raise ValueError(f"action_space.spaces[{i}] of a OneOf must hold Box spaces only, got {option}")
             self._discrete_leaves: list[DiscreteLeaf] = []
             options: list[tuple[Path, spaces.Space]] = [(("option",), option) for option in space.spaces]
             self.is_shared = False
@@ -102,11 +106,12 @@ class HybridActionSpec:
                 f"{n_joint} joint discrete actions are more than the {MAX_DISCRETE_ACTIONS} supported, in {space}"
             )
         self.n_discrete_actions = n_joint
-        self._boxes = [collect_boxes(option, path) for path, option in options]
         if isinstance(space, spaces.OneOf):
+            self._boxes = [collect_boxes(part, path, f"action_space.spaces[{i}]") for i, (path, part) in enumerate(options)]
             # The part of the native action behind the index lives under the key "option" while it is being built
             self._templates: list[Any] = [{"option": template_action(option)} for option in space.spaces]
         else:
+            self._boxes = [collect_boxes(part, path) for path, part in options]
             self._templates = [template_action(space)]
         self._build_tables()
 
