@@ -1,5 +1,6 @@
 """The package installs as a wheel, with its data and without the tests."""
 
+import re
 import subprocess
 import sys
 import zipfile
@@ -36,3 +37,10 @@ def test_import_is_light():
     code = "import sys, sb3_chdp; print([m for m in ('rl_zoo3', 'pygame', 'optuna', 'matplotlib.pyplot') if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_example_of_the_readme():
+    code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1]
+    names: dict = {}
+    exec(code.replace("2_000", "150"), names)
+    assert names["Drone"].action_space.contains(names["action"])

@@ -41,8 +41,6 @@ def test_raw_env(algorithm, layout):
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("vec_env_cls, n_envs", [(DummyVecEnv, 4), (SubprocVecEnv, 1), (SubprocVecEnv, 4)])
 def test_vec_envs(algorithm, layout, vec_env_cls, n_envs):
-    if vec_env_cls is SubprocVecEnv and layout in ("flat", "shared", "product"):
-        pytest.skip("one tuple, one dict and one OneOf layout are enough for the slow subprocesses")
     env_kwargs = dict(env_kwargs={"layout": layout}, vec_env_cls=vec_env_cls, seed=0)
     vec_env = make_vec_env(make_layout_env, n_envs, **env_kwargs)
     model = make_model(algorithm, vec_env).learn(40)
