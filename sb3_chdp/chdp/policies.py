@@ -110,7 +110,7 @@ class CHDPPolicy(HybridPolicy):
     :param action_space: space of the action rows, with ``latent_dim`` latent columns
     :param lr_schedule: learning rate schedule
     :param net_arch: hidden layers, one list for all networks or ``dict(pi=..., qf=...)`` for the noise predictors and
-        the critics; by default ``dict(pi=[128, 128], qf=[256, 256])``, for images no hidden layer before the features
+        the critics; by default ``dict(pi=[128, 128], qf=[256, 256])``
     :param activation_fn: activation function
     :param features_extractor_class: features extractor to use
     :param features_extractor_kwargs: its keyword arguments
