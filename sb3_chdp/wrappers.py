@@ -4,9 +4,8 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 
-from sb3_chdp.common.spaces import HybridActionSpec
+from sb3_chdp.common.spaces import ScoreBox
 
 
 class FlattenHybridAction(gym.ActionWrapper[np.ndarray, np.ndarray, Any]):
@@ -22,16 +21,12 @@ class FlattenHybridAction(gym.ActionWrapper[np.ndarray, np.ndarray, Any]):
 
     def __init__(self, env: gym.Env, action_layout: str = "auto"):
         super().__init__(env)
-        self.spec_of_action = HybridActionSpec(env.action_space, action_layout)
-        size = self.spec_of_action.n_discrete_actions + self.spec_of_action.n_parameters
-        self.action_space = spaces.Box(-1.0, 1.0, (size,), dtype=np.float32)
+        self.score_space = ScoreBox(env.action_space, action_layout)
+        self.action_space = self.score_space
 
     def action(self, action: np.ndarray) -> Any:
         """
         :param action: (K + P,) scores and parameters
         :return: the native action
         """
-        spec = self.spec_of_action
-        scores, parameters = np.split(np.asarray(action), [spec.n_discrete_actions])
-        k = int(scores.argmax())
-        return spec.to_native(np.concatenate([[k], parameters[spec.parameter_index[k]]]))
+        return self.score_space.to_native(np.asarray(action)[None])[0]

@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from stable_baselines3 import TD3
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chdp import FlattenHybridAction
@@ -22,10 +23,7 @@ def same_predictions(first, second):
 
 
 def optimizers(model):
-    names = [name for name in model._get_torch_save_params()[0] if name.endswith("optimizer")]
-    return [
-        model.critic.optimizer if name.startswith("critic") else getattr(model.policy, name.split(".")[1]) for name in names
-    ]
+    return [recursive_getattr(model, name) for name in model._get_torch_save_params()[0] if name.endswith("optimizer")]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

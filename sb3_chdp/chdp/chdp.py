@@ -13,6 +13,7 @@ from torch.nn import functional as F
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, CooperativeActor, MlpPolicy, MultiInputPolicy
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.policies import HybridCritic
+from sb3_chdp.common.spaces import HybridBox
 from sb3_chdp.common.type_aliases import HybridReplaySamples
 from sb3_chdp.common.utils import polyak_update
 
@@ -215,8 +216,10 @@ class CHDP(HybridOffPolicyAlgorithm):
             exploration_noise=self.exploration_noise,
         )
 
-    def _latent_dim(self, n_discrete_actions: int) -> int:
-        return self.latent_dim if self.codebook else n_discrete_actions
+    def _make_hybrid_space(self) -> HybridBox:
+        box = super()._make_hybrid_space()
+        latent_dim = self.latent_dim if self.codebook else box.spec.n_discrete_actions
+        return HybridBox(self.action_space, self.action_layout, latent_dim)
 
     def _setup_model(self) -> None:
         super()._setup_model()

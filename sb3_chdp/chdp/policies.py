@@ -21,9 +21,12 @@ from sb3_chdp.chdp.codebook import Codebook, OneHotCodebook
 from sb3_chdp.chdp.diffusion import DeterministicModel, DiffusionModel
 from sb3_chdp.common.policies import HybridCritic, HybridPolicy
 from sb3_chdp.common.spaces import HybridActionSpec, HybridBox
+from sb3_chdp.common.utils import hash_observations
 
 # Spread of the latents around a codeword in random actions
 RANDOM_LATENT_NOISE = 0.1
+# Number of noise chains that deterministic predictions choose from
+FIXED_NOISE_CHAINS = 1024
 
 
 class CooperativeActor(BaseModel):
@@ -218,11 +221,10 @@ class CHDPPolicy(HybridPolicy):
         if self.use_codebook:
             self.codebook_optimizer = self._make_optimizer(list(codebook.parameters()), lr_schedule)
 
-        # Noise of deterministic predictions, the same for every observation and every model
+        # Noise of deterministic predictions, the same for every model
         generator = th.Generator().manual_seed(0)
         for name, model in (("latent", self.actor.discrete_policy), ("parameter", self.actor.continuous_policy)):
-            noise = model.draw_noise(self.n_action_candidates, generator)
-            self.register_buffer(f"fixed_{name}_noise", noise, persistent=False)
+            self.register_buffer(f"fixed_{name}_noise", model.draw_noise(FIXED_NOISE_CHAINS, generator), persistent=False)
 
     def _make_model(self, dim: int, condition_dim: int, net_arch: list[int]) -> DiffusionModel | DeterministicModel:
         if not self.diffusion:
@@ -252,21 +254,23 @@ class CHDPPolicy(HybridPolicy):
         """
         Draw ``n_action_candidates`` actions per observation and keep the one of highest target min(Q1, Q2).
 
-        Deterministic predictions draw with the same noise every time.
+        Deterministic predictions take their noise from a fixed store, at a place that depends on the observation: one and
+        the same noise in all states would repeat a policy's mistakes where sampling gets away from them. They use the
+        target policies, averages of the policies over the last updates, which do not waver as those do.
 
         :return: (B, 1 + Pmax + latent_dim) rows
         """
         n_candidates = self.n_action_candidates
-        features = self.actor_features(observation)
+        actor = self.actor_target if deterministic else self.actor
+        features = actor.features(observation)
         batch_size = features.shape[0]
         noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None)
         if deterministic:
-            noise = (
-                th.cat([self.fixed_latent_noise] * batch_size, dim=-2),
-                th.cat([self.fixed_parameter_noise] * batch_size, dim=-2),
-            )
+            chains = hash_observations(observation)[:, None] + th.arange(n_candidates, device=features.device)
+            chains = chains.flatten() % FIXED_NOISE_CHAINS
+            noise = (self.fixed_latent_noise[..., chains, :], self.fixed_parameter_noise[..., chains, :])
         features = features.repeat_interleave(n_candidates, dim=0)
-        latents, k, parameters = self.actor.sample(features, noise)
+        latents, k, parameters = actor.sample(features, noise)
         rows = th.cat([k[:, None].float(), parameters, latents], dim=1)
         if n_candidates == 1:
             return rows
@@ -293,7 +297,8 @@ class CHDPPolicy(HybridPolicy):
             if len(undecided) == 0:
                 break
             spread /= 2
-        return np.concatenate([rows, latents.cpu().numpy()], axis=1)
+        rows[:, self.action_space.spec.row_size :] = latents.cpu().numpy()
+        return rows
 
     def set_training_mode(self, mode: bool) -> None:
         """

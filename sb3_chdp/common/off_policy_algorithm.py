@@ -67,7 +67,9 @@ class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
         seed: int | None = None,
         device: th.device | str = "auto",
     ):
-        super().__init__(
+        # Not super(): TD3 comes in between for the algorithms that share its train()
+        OffPolicyAlgorithm.__init__(
+            self,
             policy,
             env,
             learning_rate,
@@ -102,9 +104,9 @@ class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
         """:return: arguments of the algorithm that shape its networks, handed to the policy beside ``policy_kwargs``"""
         return {}
 
-    def _latent_dim(self, n_discrete_actions: int) -> int:
-        """:return: number of latent columns that the algorithm stores behind the parameters"""
-        return 0
+    def _make_hybrid_space(self) -> HybridBox:
+        """:return: the space of the rows that buffer and networks work with"""
+        return HybridBox(self.action_space, self.action_layout)
 
     def _setup_model(self) -> None:
         check_policy_kwargs(self.policy_class, self.policy_kwargs)
@@ -114,8 +116,7 @@ class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
             max(self.exploration_fraction, 1e-9),  # the schedule divides by it
         )
         native_space, policy_kwargs = self.action_space, self.policy_kwargs
-        hybrid_box = HybridBox(native_space, self.action_layout)
-        self.hybrid_space = HybridBox(native_space, self.action_layout, self._latent_dim(hybrid_box.spec.n_discrete_actions))
+        self.hybrid_space = self._make_hybrid_space()
         # Buffer and policy are built for the rows; the model keeps the user's space
         self.action_space = self.hybrid_space
         self.policy_kwargs = {**policy_kwargs, **self._network_kwargs()}
@@ -146,14 +147,13 @@ class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
             rows = self.policy.random_rows(rng, n_envs)
         else:
             assert self._last_obs is not None, "self._last_obs was not set"
-            rows = self.policy.predict_rows(self._last_obs)  # type: ignore[arg-type]
-            spec = self.hybrid_space.spec
-            if action_noise is not None:
-                parameters = rows[:, 1 : spec.row_size] + action_noise()
-                rows[:, 1 : spec.row_size] = np.clip(parameters, -1, 1) * spec.mask[rows[:, 0].astype(int)]
+            if action_noise is None:
+                rows = self.policy.predict_rows(self._last_obs)  # type: ignore[arg-type]
+            else:
+                rows = self.policy.noisy_rows(self._last_obs, action_noise())  # type: ignore[arg-type]
             if explores.any():
                 rows[explores] = self.policy.random_rows(rng, int(explores.sum()))
-        return self.hybrid_space.spec.to_native_batch(rows), rows
+        return self.hybrid_space.to_native(rows), rows
 
     def _store_transition(
         self,

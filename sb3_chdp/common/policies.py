@@ -42,7 +42,7 @@ class HybridPolicy(BasePolicy):
         :raises ValueError: if the observation holds NaN or infinity
         """
         rows, vectorized_env = self._predict_rows(observation, deterministic)
-        actions = self.action_space.spec.to_native_batch(rows)
+        actions = self.action_space.to_native(rows)
         return (actions if vectorized_env else actions[0]), state
 
     def predict_rows(self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool = False) -> np.ndarray:
@@ -72,6 +72,14 @@ class HybridPolicy(BasePolicy):
             rows = self._predict(obs_tensor, deterministic=deterministic)
         return rows.cpu().numpy(), vectorized_env
 
+    def noisy_rows(self, observation: np.ndarray | dict[str, np.ndarray], noise: np.ndarray) -> np.ndarray:
+        """
+        :param observation: n observations
+        :param noise: action noise, of the width that the rows of the algorithm take
+        :return: rows of sampled actions with the noise added
+        """
+        return self.action_space.add_noise(self.predict_rows(observation), noise)
+
     def random_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """
         Uniformly random actions, for the warm-up and for exploration.
@@ -80,7 +88,7 @@ class HybridPolicy(BasePolicy):
         :param n: number of rows
         :return: (n, columns) rows
         """
-        return self.action_space.spec.sample_rows(rng, n).astype(np.float32)
+        return self.action_space.sample_rows(rng, n)
 
 
 class HybridCritic(ContinuousCritic):

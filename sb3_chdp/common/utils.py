@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.type_aliases import PyTorchObs
 
 
 def polyak_update(params: Iterable[th.Tensor], target_params: Iterable[th.Tensor], tau: float) -> None:
@@ -18,6 +19,23 @@ def polyak_update(params: Iterable[th.Tensor], target_params: Iterable[th.Tensor
     """
     with th.no_grad():
         th._foreach_lerp_(list(target_params), list(params), tau)
+
+
+def hash_observations(observations: PyTorchObs) -> th.Tensor:
+    """
+    :param observations: batch of observations
+    :return: (B,) non-negative integers that depend on the content of each observation only
+    """
+    parts = observations.values() if isinstance(observations, dict) else [observations]
+    total: th.Tensor | int = 0
+    for part in parts:
+        flat = part.reshape(len(part), -1)
+        bits = flat.float().view(th.int32).long()
+        # Multiplicative hashing; products wrap around
+        factors = th.arange(1, flat.shape[1] + 1, device=flat.device) * 0x5851F42D4C957F2D + 1
+        total = total * 31 + (bits * factors).sum(dim=1)
+    assert isinstance(total, th.Tensor)
+    return (total ^ (total >> 29)).abs()
 
 
 def check_finite(name: str, value: np.ndarray | dict[str, np.ndarray]) -> None:

@@ -1,0 +1,182 @@
+"""What the baselines share that are SB3's TD3 on scores and parameters, answering in native actions."""
+
+from typing import Any, TypeVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.td3 import TD3
+from stable_baselines3.td3.policies import Actor, TD3Policy
+from torch import nn
+
+from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
+from sb3_chdp.common.policies import HybridPolicy
+from sb3_chdp.common.spaces import HybridBox, ScoreBox
+
+SelfScoreTD3 = TypeVar("SelfScoreTD3", bound="ScoreTD3")
+
+
+class _InvertGradient(th.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, actions: th.Tensor) -> th.Tensor:
+        ctx.save_for_backward(actions)
+        return actions.view_as(actions)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: th.Tensor) -> th.Tensor:  # type: ignore[override]
+        (actions,) = ctx.saved_tensors
+        # The loss falls along -gradient: where that leads up, what counts is the way left to 1, else to -1
+        room = th.where(gradient < 0, 1 - actions, 1 + actions) / 2
+        return gradient * room
+
+
+class InvertingGradients(nn.Module):
+    """
+    Identity whose gradient shrinks as an action in [-1, 1] approaches the bound that it is pushed to, and turns back beyond
+    it (Hausknecht and Stone, 2016).
+    """
+
+    def forward(self, actions: th.Tensor) -> th.Tensor:
+        return _InvertGradient.apply(actions)
+
+
+class ScoreTD3Policy(HybridPolicy, TD3Policy):
+    """
+    SB3's TD3 policy with an actor of K scores and P parameters; the action of highest score is taken.
+
+    All arguments but one are those of :class:`stable_baselines3.td3.policies.TD3Policy`.
+
+    :param inverting_gradients: whether to invert the gradients at the actor's output
+    """
+
+    action_space: ScoreBox  # type: ignore[assignment]
+
+    def __init__(self, *args: Any, inverting_gradients: bool = False, **kwargs: Any):
+        self.inverting_gradients = inverting_gradients
+        super().__init__(*args, **kwargs)
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        actor = super().make_actor(features_extractor)
+        if self.inverting_gradients:
+            actor.mu = nn.Sequential(*actor.mu, InvertingGradients())
+        return actor
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "inverting_gradients": self.inverting_gradients}
+
+
+class ScoreTD3(HybridOffPolicyAlgorithm, TD3):
+    """
+    Base class: SB3's TD3, its ``train()`` unchanged, on the space of scores and parameters.
+
+    The parameters are those of :class:`stable_baselines3.TD3` and :class:`HybridOffPolicyAlgorithm`, and
+
+    :param exploration_noise: standard deviation of the Gaussian noise on scores and parameters, if no ``action_noise``
+        is given
+    :param inverting_gradients: whether the gradients at the actor's output are inverted
+    """
+
+    policy: ScoreTD3Policy  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        policy: str | type[ScoreTD3Policy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 100_000,
+        learning_starts: int = 500,
+        batch_size: int = 128,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        policy_delay: int = 2,
+        target_policy_noise: float = 0.2,
+        target_noise_clip: float = 0.5,
+        exploration_noise: float = 0.1,
+        inverting_gradients: bool = False,
+        action_layout: str = "auto",
+        exploration_fraction: float = 0.2,
+        exploration_initial_eps: float = 1.0,
+        exploration_final_eps: float = 0.05,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            action_layout=action_layout,
+            exploration_fraction=exploration_fraction,
+            exploration_initial_eps=exploration_initial_eps,
+            exploration_final_eps=exploration_final_eps,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+        )
+        self.policy_delay = policy_delay
+        self.target_noise_clip = target_noise_clip
+        self.target_policy_noise = target_policy_noise
+        self.exploration_noise = exploration_noise
+        self.inverting_gradients = inverting_gradients
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _make_hybrid_space(self) -> HybridBox:
+        return ScoreBox(self.action_space, self.action_layout)
+
+    def _network_kwargs(self) -> dict[str, Any]:
+        return {"inverting_gradients": self.inverting_gradients}
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if self.action_noise is None:
+            size = self.hybrid_space.shape[0]
+            self.action_noise = NormalActionNoise(np.zeros(size), np.full(size, self.exploration_noise))
+
+    def learn(
+        self: SelfScoreTD3,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfScoreTD3:
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name or type(self).__name__,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )

@@ -1,0 +1,88 @@
+"""Policies of HHQN-TD3: an upper actor of K scores, and a lower actor of P parameters that sees the scores."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN, create_mlp
+from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.td3.policies import Actor
+from torch import nn
+
+from sb3_chdp.common.spaces import ScoreBox
+from sb3_chdp.common.td3 import InvertingGradients, ScoreTD3Policy
+
+
+class HierarchicalActor(Actor):
+    """
+    Deterministic two-stage actor.
+
+    The arguments are those of SB3's TD3 actor, and
+
+    :param inverting_gradients: whether to invert the gradients at both outputs
+    """
+
+    action_space: ScoreBox
+
+    def __init__(self, *args: Any, inverting_gradients: bool = False, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        spec = self.action_space.spec
+        end = [InvertingGradients()] if inverting_gradients else []
+
+        def mlp(input_dim: int, output_dim: int) -> nn.Sequential:
+            layers = create_mlp(input_dim, output_dim, self.net_arch, self.activation_fn, squash_output=True)
+            return nn.Sequential(*layers, *end)
+
+        # In place of the one-stage actor
+        self.mu = mlp(self.features_dim, spec.n_discrete_actions)
+        self.lower = mlp(self.features_dim + spec.n_discrete_actions, spec.n_parameters)
+
+    def forward(self, obs: PyTorchObs, noise: th.Tensor | None = None) -> th.Tensor:
+        """
+        :param obs: observations
+        :param noise: (B, K + P) action noise; the lower actor sees the noisy scores, which decide what is executed
+        :return: (B, K + P) scores and parameters
+        """
+        features = self.extract_features(obs, self.features_extractor)
+        scores = self.mu(features)
+        if noise is not None:
+            scores = (scores + noise[:, : scores.shape[1]]).clamp(-1, 1)
+        parameters = self.lower(th.cat([features, scores], dim=1))
+        if noise is not None:
+            parameters = (parameters + noise[:, scores.shape[1] :]).clamp(-1, 1)
+        return th.cat([scores, parameters], dim=1)
+
+
+class HHQNTD3Policy(ScoreTD3Policy):
+    """Policy class (with both actors and the critics) for HHQN-TD3, see :class:`ScoreTD3Policy`."""
+
+    actor: HierarchicalActor
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> HierarchicalActor:
+        actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
+        return HierarchicalActor(**actor_kwargs, inverting_gradients=self.inverting_gradients).to(self.device)
+
+    def noisy_rows(self, observation: np.ndarray | dict[str, np.ndarray], noise: np.ndarray) -> np.ndarray:
+        self.set_training_mode(False)
+        obs_tensor, _ = self.obs_to_tensor(observation)
+        with th.no_grad():
+            # One environment: the noise has no batch dimension
+            noise_tensor = th.as_tensor(noise, dtype=th.float32, device=self.device).view(-1, *self.action_space.shape)
+            return self.actor(obs_tensor, noise_tensor).cpu().numpy()
+
+
+MlpPolicy = HHQNTD3Policy
+
+
+class CnnPolicy(HHQNTD3Policy):
+    """:class:`HHQNTD3Policy` for images: ``features_extractor_class`` is :class:`NatureCNN` by default."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"features_extractor_class": NatureCNN, **kwargs})
+
+
+class MultiInputPolicy(HHQNTD3Policy):
+    """:class:`HHQNTD3Policy` for dict observations: ``features_extractor_class`` is :class:`CombinedExtractor` by default."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"features_extractor_class": CombinedExtractor, **kwargs})

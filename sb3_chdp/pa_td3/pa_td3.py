@@ -1,0 +1,45 @@
+"""TD3 on scores and parameters (PADDPG with TD3)."""
+
+from typing import ClassVar
+
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_chdp.common.td3 import ScoreTD3
+from sb3_chdp.pa_td3.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+
+
+class PATD3(ScoreTD3):
+    """
+    Parameterized Action TD3 (PA-TD3), PADDPG with TD3 in place of DDPG
+
+    One actor gives a score to every discrete action and parameters to all of them; the action of highest score is taken
+    with its own parameters. The critics see all scores and parameters. It is SB3's TD3 on the same environment behind
+    :class:`FlattenHybridAction`, with native actions.
+
+    Papers: Hausknecht and Stone (2016), https://arxiv.org/abs/1511.04143; Fujimoto et al. (2018),
+    https://arxiv.org/abs/1802.09477. Reference scripts: HyAR repository.
+
+    Differences from the reference scripts:
+        1. uniformly random actions with a decreasing probability (``exploration_*``; initial and final rate 0: the scripts);
+        2. tanh outputs with plain policy gradients; ``inverting_gradients=True`` inverts them on top of tanh, as the
+           scripts do, which damps them twice;
+        3. no clipping of the actor's gradient norm;
+        4. one linear output layer for scores and parameters, which is the same network as two heads on a common trunk;
+        5. time limits bootstrap in all environments.
+
+    The parameters are those of :class:`stable_baselines3.TD3`, and
+
+    :param exploration_noise: standard deviation of the Gaussian noise on scores and parameters, if no ``action_noise`` (of
+        size K + P) is given
+    :param inverting_gradients: whether the gradients at the actor's output are inverted
+    :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
+    :param exploration_fraction: fraction of the training over which the rate of uniformly random actions is reduced
+    :param exploration_initial_eps: initial probability of a uniformly random action
+    :param exploration_final_eps: final probability of a uniformly random action
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
