@@ -4,13 +4,15 @@ Learning curves of one algorithm on the benchmarks, several seeds in parallel, o
     python benchmarks/learning.py --envs HardMove6-v0 Platform-v0 --seeds 0 1 2 --steps 60000 --jobs 2
 
 Every cell appends its evaluations to <out>/<env>/seed_<k>.csv and keeps its settings and versions beside it in
-seed_<k>.json. Cells that are complete are skipped. Hyperparameters are those of hyperparams/<algo>.yml, --set overrides.
+seed_<k>.json. Cells that are complete are skipped. --evaluate prints a table row per saved model: success and return of
+deterministic actions, then of sampled ones. Hyperparameters are those of hyperparams/<algo>.yml, --set overrides.
 """
 
 import argparse
 import csv
 import json
 import multiprocessing
+import os
 import platform
 import time
 from pathlib import Path
@@ -27,6 +29,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_chdp
 
+ALGORITHMS = {"chdp": sb3_chdp.CHDP, "pa_td3": sb3_chdp.PATD3, "hhqn_td3": sb3_chdp.HHQNTD3}
 ROOT = Path(__file__).parent
 FIELDS = ("timesteps", "gradient_steps", "success", "return", "length", "deterministic", "seconds")
 
@@ -60,36 +63,32 @@ class CurveCallback(BaseCallback):
             self.evaluate()
         return True
 
+    def score(self, deterministic: bool) -> tuple[float, float, float]:
+        """:return: mean success, return and length of the evaluation episodes"""
+        successes: list[bool] = []
+
+        def note(local_vars: dict[str, Any], _: dict[str, Any]) -> None:
+            if local_vars["done"]:
+                successes.append(local_vars["info"]["is_success"])
+
+        returns, lengths = evaluate_policy(
+            self.model,
+            self.eval_env,
+            self.n_eval_episodes,
+            deterministic=deterministic,
+            return_episode_rewards=True,
+            callback=note,
+        )
+        return float(np.mean(successes)), float(np.mean(returns)), float(np.mean(lengths))
+
     def evaluate(self) -> None:
         # The clock stands still while evaluating
         self.seconds += time.perf_counter() - self.started
         for deterministic in self.modes:
-            successes: list[bool] = []
-
-            def note(local_vars: dict[str, Any], _: dict[str, Any], successes: list[bool] = successes) -> None:
-                if local_vars["done"]:
-                    successes.append(local_vars["info"]["is_success"])
-
-            returns, lengths = evaluate_policy(
-                self.model,
-                self.eval_env,
-                self.n_eval_episodes,
-                deterministic=deterministic,
-                return_episode_rewards=True,
-                callback=note,
-            )
+            scores = [round(score, 4) for score in self.score(deterministic)]
+            line = [self.num_timesteps, self.model._n_updates, *scores, int(deterministic), round(self.seconds, 1)]
             with self.path.open("a", newline="") as file:
-                csv.writer(file).writerow(
-                    [
-                        self.num_timesteps,
-                        self.model._n_updates,
-                        round(float(np.mean(successes)), 4),
-                        round(float(np.mean(returns)), 4),
-                        round(float(np.mean(lengths)), 3),
-                        int(deterministic),
-                        round(self.seconds, 1),
-                    ]
-                )
+                csv.writer(file).writerow(line)
         self.started = time.perf_counter()
 
 
@@ -110,7 +109,7 @@ def run_cell(cell: tuple[str, int, argparse.Namespace]) -> str:
         return f"{env_id} seed {seed}: already complete"
     env = make_vec_env(env_id, n_envs, seed=seed)
     eval_env = make_vec_env(env_id, 8, seed=10_000 + seed)
-    model = getattr(sb3_chdp, args.algo.upper())(env=env, seed=seed, device="cpu", **hyperparams)
+    model = ALGORITHMS[args.algo](env=env, seed=seed, device="cpu", **hyperparams)
     callback = CurveCallback(eval_env, path, args.eval_freq, args.eval_episodes, args.stochastic)
     model.learn(total, callback=callback)
     meta = {
@@ -128,9 +127,21 @@ def run_cell(cell: tuple[str, int, argparse.Namespace]) -> str:
     return f"{env_id} seed {seed}: {path.read_text().splitlines()[-1]}"
 
 
+def evaluate_cell(cell: tuple[str, int, argparse.Namespace]) -> str:
+    """Evaluate the saved model of one seed, with deterministic and with sampled actions."""
+    env_id, seed, args = cell
+    th.set_num_threads(1)
+    model = ALGORITHMS[args.algo].load(Path(args.out) / env_id / f"seed_{seed}.zip", device="cpu", buffer_size=1)
+    callback = CurveCallback(make_vec_env(env_id, 8, seed=20_000 + seed), Path(os.devnull), 0, args.eval_episodes, True)
+    callback.model = model
+    results = [callback.score(deterministic) for deterministic in (True, False)]
+    (success, mean_return, _), (sampled_success, sampled_return, _) = results
+    return f"| {env_id} | {seed} | {success:.3f} | {mean_return:.3f} | {sampled_success:.3f} | {sampled_return:.3f} |"
+
+
 def parse_args() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--algo", default="chdp")
+    parser.add_argument("--algo", default="chdp", choices=list(ALGORITHMS))
     parser.add_argument("--envs", nargs="+", default=list(sb3_chdp.envs.ENV_IDS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--steps", type=int, help="environment steps (default: those of the YAML file)")
@@ -138,6 +149,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--eval-episodes", type=int, default=100)
     parser.add_argument("--stochastic", action="store_true", help="evaluate sampled actions as well")
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--evaluate", action="store_true", help="only evaluate the models that --save left")
     parser.add_argument("--save", action="store_true", help="save the models")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="override hyperparameters (YAML values)")
     parser.add_argument("--out", default=str(ROOT / "results" / "learning"))
@@ -150,5 +162,5 @@ if __name__ == "__main__":
     args = parse_args()
     cells = [(env_id, seed, args) for seed in args.seeds for env_id in args.envs]
     with multiprocessing.get_context("spawn").Pool(args.jobs, maxtasksperchild=1) as pool:
-        for message in pool.imap_unordered(run_cell, cells):
+        for message in pool.imap(evaluate_cell if args.evaluate else run_cell, cells):
             print(message, flush=True)
