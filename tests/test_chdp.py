@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from sb3_chdp import CHDP
 from sb3_chdp.chdp.codebook import Codebook
+from sb3_chdp.common.utils import hash_observations
 from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, make_layout_env
 
 FAST = dict(
@@ -297,6 +298,17 @@ def test_deterministic_predictions_repeat(diffusion):
     for one, row in zip(obs, first, strict=True):
         np.testing.assert_allclose(model.policy.predict_rows(one, deterministic=True), row, atol=1e-5)
     assert (model.policy.predict_rows(obs) != first).any()
+
+
+def test_noise_of_deterministic_predictions_depends_on_the_observation():
+    vectors, images = th.rand(1000, 4), th.randint(256, (1000, 1, 6, 6), dtype=th.uint8)
+    for observations in (vectors, images, {"v": vectors, "i": images}):
+        hashes = hash_observations(observations)
+        assert hashes.shape == (1000,) and len((hashes % 1024).unique()) > 550  # 637 of 1024 expected
+        if isinstance(observations, th.Tensor):
+            assert (hash_observations(observations[5:7]) == hashes[5:7]).all()
+    # A small change is enough
+    assert (hash_observations(vectors + 1e-6) != hash_observations(vectors)).float().mean() > 0.99
 
 
 def test_the_best_candidate_acts():

@@ -39,7 +39,6 @@ class CooperativeActor(BaseModel):
     :param observation_space: observation space
     :param action_space: space of the action rows
     :param features_extractor: network to extract features, the same for both agents
-    :param features_dim: number of features
     :param codebook: quantises the latents
     :param discrete_policy: model of the latents given the features
     :param continuous_policy: model of the parameters given the features and a codeword
