@@ -117,7 +117,7 @@ def test_dict_and_image_observations(algorithm, policy, share_features_extractor
         dict(tensorboard_log="."),
         dict(action_layout="per_action"),
     ],
-    ids=str,
+    ids=lambda kwargs: "-".join(kwargs),  # the same in every worker of pytest-xdist
 )
 def test_training_options(algorithm, kwargs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
