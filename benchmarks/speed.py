@@ -4,7 +4,7 @@ Speed of the environments, of acting and of a gradient step; medians over repeat
     make speed
 
 The environments are compared with the figures of the original packages, which were measured on another machine (AMD EPYC,
-2 vCPUs, Python 3.11; see `REFERENCE_RATES`): read those ratios as orders of magnitude.
+2 vCPUs, Python 3.11.7): read those ratios as orders of magnitude.
 """
 
 import argparse
