@@ -69,8 +69,8 @@ class CHDP(HybridOffPolicyAlgorithm):
         of the target critics is taken
     :param relabel_latents: whether a stored latent that does not decode to the stored discrete action any more is
         replaced by that action's present codeword
-    :param codebook_learning_rate: learning rate of the codebook; at the rate of the policies it moves faster than the
-        critic can follow
+    :param codebook_learning_rate: learning rate of the codebook; the faster it moves, the more stored latents
+        decode to other actions (``train/latent_drift``)
     :param max_grad_norm: bound on the gradient norm of every network, None for none
     :param policy_delay: policies and targets are updated once every ``policy_delay`` critic updates
     :param diffusion: False replaces both diffusion policies by deterministic MLPs (ablation)
