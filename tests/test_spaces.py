@@ -82,6 +82,18 @@ def test_native_actions_are_in_the_space_and_round_trip(space, seed):
             np.testing.assert_allclose(after, before, rtol=0, atol=4e-16 * max(width, 1000))
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.int8, np.uint16, np.int32, np.int64, np.uint64])
+def test_integer_boxes_reach_the_limits_of_their_type(dtype):
+    low, high = np.iinfo(dtype).min, np.iinfo(dtype).max
+    spec = HybridActionSpec(spaces.Tuple((spaces.Discrete(1), spaces.Box(low, high, (1,), dtype))))
+    _, (lowest,) = spec.to_native([0, -1.0])
+    _, (highest,) = spec.to_native([0, 1.0])
+    if np.dtype(dtype).itemsize < 8:
+        assert (lowest, highest) == (low, high)
+    else:  # the nearest floating-point number inside the bounds
+        assert low <= int(lowest) <= low + 1024 and high - 2048 <= int(highest) <= high
+
+
 @settings(max_examples=100, deadline=None)
 @given(radices=st.lists(st.integers(1, 4), min_size=1, max_size=4), seed=st.integers(0, 1000))
 def test_joint_index_is_a_bijection(radices, seed):

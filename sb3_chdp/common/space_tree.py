@@ -179,10 +179,10 @@ def template_action(space: spaces.Space) -> Any:
 def cast_to_box(values: np.ndarray, box: spaces.Box) -> np.ndarray:
     """Reshape float64 values to a box; integers are rounded, and the result is inside the bounds in the box's dtype."""
     if box.dtype.kind in "iu":
-        values = np.rint(values)
-        # The bounds of 64-bit integers are not floats: clip before the cast and after it
+        # The bounds of 64-bit integers are not floats: clip to the floats inside before the cast, and to the bounds after
+        # it. Rounding comes second, else nextafter would cost narrow integers their largest value (255 -> 254)
         limits = np.iinfo(box.dtype.name)
-        values = np.clip(values, np.nextafter(float(limits.min), 0), np.nextafter(float(limits.max), 0))
+        values = np.rint(np.clip(values, np.nextafter(float(limits.min), 0), np.nextafter(float(limits.max), 0)))
     values = values.reshape(box.shape).astype(box.dtype)
     # Faster than clip; asarray because ufuncs make scalars of 0-dimensional arrays
     return np.asarray(np.minimum(np.maximum(values, box.low), box.high))
