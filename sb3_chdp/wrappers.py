@@ -5,7 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from sb3_chdp.common.spaces import ScoreBox
+from sb3_chdp.common.hybrid_box import ScoreBox
 
 
 class FlattenHybridAction(gym.ActionWrapper[np.ndarray, np.ndarray, Any]):

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_chdp import HybridActionSpec
-from sb3_chdp.common.spaces import HybridAction, HybridBox
+from sb3_chdp.common.hybrid_box import HybridBox
+from sb3_chdp.common.spaces import HybridAction
 from tests.hybrid_envs import box, layouts
 
 

@@ -11,9 +11,9 @@ from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name
 from torch.nn import functional as F
 
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, CooperativeActor, MlpPolicy, MultiInputPolicy
+from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.policies import HybridCritic
-from sb3_chdp.common.spaces import HybridBox
 from sb3_chdp.common.type_aliases import HybridReplaySamples
 from sb3_chdp.common.utils import polyak_update
 

@@ -9,9 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.torch_layers import (
     BaseFeaturesExtractor,
-    CombinedExtractor,
     FlattenExtractor,
-    NatureCNN,
     get_actor_critic_arch,
 )
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
@@ -19,8 +17,9 @@ from torch import nn
 
 from sb3_chdp.chdp.codebook import Codebook, OneHotCodebook
 from sb3_chdp.chdp.diffusion import DeterministicModel, DiffusionModel
-from sb3_chdp.common.policies import HybridCritic, HybridPolicy
-from sb3_chdp.common.spaces import HybridActionSpec, HybridBox
+from sb3_chdp.common.hybrid_box import HybridBox
+from sb3_chdp.common.policies import CnnFeatures, CombinedFeatures, HybridCritic, HybridPolicy
+from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.common.utils import hash_observations
 
 # Spread of the latents around a codeword in random actions
@@ -336,19 +335,9 @@ class CHDPPolicy(HybridPolicy):
 MlpPolicy = CHDPPolicy
 
 
-class CnnPolicy(CHDPPolicy):
-    """
-    :class:`CHDPPolicy` for images: ``features_extractor_class`` is :class:`NatureCNN` by default.
-    """
-
-    def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, **{"features_extractor_class": NatureCNN, **kwargs})
+class CnnPolicy(CnnFeatures, CHDPPolicy):
+    """:class:`CHDPPolicy` for images."""
 
 
-class MultiInputPolicy(CHDPPolicy):
-    """
-    :class:`CHDPPolicy` for dict observations: ``features_extractor_class`` is :class:`CombinedExtractor` by default.
-    """
-
-    def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, **{"features_extractor_class": CombinedExtractor, **kwargs})
+class MultiInputPolicy(CombinedFeatures, CHDPPolicy):
+    """:class:`CHDPPolicy` for dict observations."""

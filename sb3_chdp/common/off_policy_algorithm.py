@@ -1,33 +1,24 @@
 """What SB3's OffPolicyAlgorithm needs to work with the user's own hybrid action space."""
 
-import io
-import pathlib
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.policies import HybridPolicy
-from sb3_chdp.common.spaces import HybridBox
 from sb3_chdp.common.type_aliases import HybridReplaySamples, name_columns
-from sb3_chdp.common.utils import check_finite, check_policy_kwargs
-
-SelfHybridOffPolicyAlgorithm = TypeVar("SelfHybridOffPolicyAlgorithm", bound="HybridOffPolicyAlgorithm")
+from sb3_chdp.common.utils import check_finite
 
 
-class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
+class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
     """
     Base class of off-policy algorithms for hybrid action spaces.
-
-    ``model.action_space`` is the user's space; environments and ``predict`` deal in native actions. Buffers and networks
-    deal in rows ``[k | scaled parameters | latent]``.
 
     Parameters not listed here are SB3's (see :class:`OffPolicyAlgorithm`).
 
@@ -38,6 +29,8 @@ class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
     """
 
     policy: HybridPolicy
+    # Standard deviation of Gaussian noise on what the policy puts out; set by algorithms with a deterministic policy
+    exploration_noise_schedule: Schedule | None = None
 
     def __init__(
         self,
@@ -92,7 +85,7 @@ class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
             device=device,
             seed=seed,
             sde_support=False,
-            supported_action_spaces=(spaces.Tuple, spaces.Dict, spaces.OneOf),
+            supported_action_spaces=HYBRID_SPACES,
             support_multi_env=True,
         )
         self.action_layout = action_layout
@@ -100,32 +93,13 @@ class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
         self.exploration_initial_eps = exploration_initial_eps
         self.exploration_final_eps = exploration_final_eps
 
-    def _network_kwargs(self) -> dict[str, Any]:
-        """:return: arguments of the algorithm that shape its networks, handed to the policy beside ``policy_kwargs``"""
-        return {}
-
-    def _make_hybrid_space(self) -> HybridBox:
-        """:return: the space of the rows that buffer and networks work with"""
-        return HybridBox(self.action_space, self.action_layout)
-
     def _setup_model(self) -> None:
-        check_policy_kwargs(self.policy_class, self.policy_kwargs)
-        self.exploration_schedule = LinearSchedule(
-            self.exploration_initial_eps,
-            self.exploration_final_eps,
-            max(self.exploration_fraction, 1e-9),  # the schedule divides by it
-        )
-        native_space, policy_kwargs = self.action_space, self.policy_kwargs
-        self.hybrid_space = self._make_hybrid_space()
-        # Buffer and policy are built for the rows; the model keeps the user's space
-        self.action_space = self.hybrid_space
-        self.policy_kwargs = {**policy_kwargs, **self._network_kwargs()}
-        try:
-            super()._setup_model()
-        finally:
-            self.action_space, self.policy_kwargs = native_space, policy_kwargs
-        # set_random_seed() seeded the stand-in
-        self.action_space.seed(None if self.seed is None else int(self.seed))
+        self.exploration_schedule = self._exploration_schedule(self.exploration_initial_eps, self.exploration_final_eps)
+        super()._setup_model()
+
+    def _exploration_schedule(self, initial: float, final: float) -> Schedule:
+        """:return: linear schedule that ends after ``exploration_fraction`` of the training"""
+        return LinearSchedule(initial, final, max(self.exploration_fraction, 1e-9))  # it divides by the fraction
 
     def _sample_action(  # type: ignore[override]  # a list of native actions
         self,
@@ -135,7 +109,7 @@ class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
     ) -> tuple[list[Any], np.ndarray]:
         """
         :param learning_starts: number of steps with uniformly random actions only
-        :param action_noise: noise that is added to the scaled parameters of the policy's actions
+        :param action_noise: noise that is added to what the policy puts out
         :param n_envs: number of environments
         :return: native actions for the environments, (n_envs, columns) rows for the replay buffer
         """
@@ -147,13 +121,20 @@ class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
             rows = self.policy.random_rows(rng, n_envs)
         else:
             assert self._last_obs is not None, "self._last_obs was not set"
-            if action_noise is None:
+            noise = self._draw_noise(n_envs) if action_noise is None else action_noise()
+            if noise is None:
                 rows = self.policy.predict_rows(self._last_obs)  # type: ignore[arg-type]
             else:
-                rows = self.policy.noisy_rows(self._last_obs, action_noise())  # type: ignore[arg-type]
+                rows = self.policy.noisy_rows(self._last_obs, noise)  # type: ignore[arg-type]
             if explores.any():
                 rows[explores] = self.policy.random_rows(rng, int(explores.sum()))
         return self.hybrid_space.to_native(rows), rows
+
+    def _draw_noise(self, n_envs: int) -> np.ndarray | None:
+        if self.exploration_noise_schedule is None:
+            return None
+        std = self.exploration_noise_schedule(self._current_progress_remaining)
+        return self.action_space.np_random.normal(0.0, std, (n_envs, self.policy.noise_dim))
 
     def _store_transition(
         self,
@@ -177,26 +158,3 @@ class HybridOffPolicyAlgorithm(OffPolicyAlgorithm):
         assert self.replay_buffer is not None
         replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
         return name_columns(replay_data, self.hybrid_space, self.gamma)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "hybrid_space"]
-
-    @classmethod
-    def load(
-        cls: type[SelfHybridOffPolicyAlgorithm],
-        path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
-        device: th.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        **kwargs: Any,
-    ) -> SelfHybridOffPolicyAlgorithm:
-        data, _, _ = load_from_zip_file(path, device="cpu", custom_objects=custom_objects)
-        if not isinstance(path, (str, pathlib.Path)):
-            path.seek(0)
-        saved_class = (data or {}).get("policy_class")
-        accepted = tuple(cls.policy_aliases.values())
-        if not (isinstance(saved_class, type) and issubclass(saved_class, accepted)):
-            raise ValueError(f"{path} is not a {cls.__name__} model: its policy is {saved_class}, not one of {accepted}")
-        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)

@@ -6,11 +6,11 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_chdp.common.spaces import HybridBox
+from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.utils import check_finite
 
 
@@ -72,10 +72,15 @@ class HybridPolicy(BasePolicy):
             rows = self._predict(obs_tensor, deterministic=deterministic)
         return rows.cpu().numpy(), vectorized_env
 
+    @property
+    def noise_dim(self) -> int:
+        """Width of the action noise that :meth:`noisy_rows` takes"""
+        return self.action_space.shape[0]
+
     def noisy_rows(self, observation: np.ndarray | dict[str, np.ndarray], noise: np.ndarray) -> np.ndarray:
         """
         :param observation: n observations
-        :param noise: action noise, of the width that the rows of the algorithm take
+        :param noise: (n, noise_dim) action noise
         :return: rows of sampled actions with the noise added
         """
         return self.action_space.add_noise(self.predict_rows(observation), noise)
@@ -89,6 +94,20 @@ class HybridPolicy(BasePolicy):
         :return: (n, columns) rows
         """
         return self.action_space.sample_rows(rng, n)
+
+
+class CnnFeatures(HybridPolicy):
+    """Mixin for policies of image observations: ``features_extractor_class`` is :class:`NatureCNN` by default."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"features_extractor_class": NatureCNN, **kwargs})
+
+
+class CombinedFeatures(HybridPolicy):
+    """Mixin for policies of dict observations: ``features_extractor_class`` is :class:`CombinedExtractor` by default."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"features_extractor_class": CombinedExtractor, **kwargs})
 
 
 class HybridCritic(ContinuousCritic):

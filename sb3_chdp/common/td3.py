@@ -2,21 +2,20 @@
 
 from typing import Any, TypeVar
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.td3 import TD3
 from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 
+from sb3_chdp.common.hybrid_box import HybridBox, ScoreBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.policies import HybridPolicy
-from sb3_chdp.common.spaces import HybridBox, ScoreBox
 
-SelfScoreTD3 = TypeVar("SelfScoreTD3", bound="ScoreTD3")
+SelfHybridTD3 = TypeVar("SelfHybridTD3", bound="HybridTD3")
 
 
 class _InvertGradient(th.autograd.Function):
@@ -43,7 +42,7 @@ class InvertingGradients(nn.Module):
         return _InvertGradient.apply(actions)
 
 
-class ScoreTD3Policy(HybridPolicy, TD3Policy):
+class HybridTD3Policy(HybridPolicy, TD3Policy):
     """
     SB3's TD3 policy with an actor of K scores and P parameters; the action of highest score is taken.
 
@@ -68,22 +67,24 @@ class ScoreTD3Policy(HybridPolicy, TD3Policy):
         return {**super()._get_constructor_parameters(), "inverting_gradients": self.inverting_gradients}
 
 
-class ScoreTD3(HybridOffPolicyAlgorithm, TD3):
+class HybridTD3(HybridOffPolicyAlgorithm, TD3):
     """
     Base class: SB3's TD3, its ``train()`` unchanged, on the space of scores and parameters.
 
     The parameters are those of :class:`stable_baselines3.TD3` and :class:`HybridOffPolicyAlgorithm`, and
 
-    :param exploration_noise: standard deviation of the Gaussian noise on scores and parameters, if no ``action_noise``
-        is given
+    :param exploration_noise: standard deviation of the Gaussian noise on the actor's output, if no ``action_noise`` is
+        given
+    :param exploration_initial_noise: initial standard deviation, which falls linearly to ``exploration_noise`` over
+        ``exploration_fraction``; None: constant
     :param inverting_gradients: whether the gradients at the actor's output are inverted
     """
 
-    policy: ScoreTD3Policy  # type: ignore[assignment]
+    policy: HybridTD3Policy  # type: ignore[assignment]
 
     def __init__(
         self,
-        policy: str | type[ScoreTD3Policy],
+        policy: str | type[HybridTD3Policy],
         env: GymEnv | str,
         learning_rate: float | Schedule = 3e-4,
         buffer_size: int = 100_000,
@@ -102,6 +103,7 @@ class ScoreTD3(HybridOffPolicyAlgorithm, TD3):
         target_policy_noise: float = 0.2,
         target_noise_clip: float = 0.5,
         exploration_noise: float = 0.1,
+        exploration_initial_noise: float | None = None,
         inverting_gradients: bool = False,
         action_layout: str = "auto",
         exploration_fraction: float = 0.2,
@@ -146,6 +148,7 @@ class ScoreTD3(HybridOffPolicyAlgorithm, TD3):
         self.target_noise_clip = target_noise_clip
         self.target_policy_noise = target_policy_noise
         self.exploration_noise = exploration_noise
+        self.exploration_initial_noise = exploration_initial_noise
         self.inverting_gradients = inverting_gradients
 
         if _init_setup_model:
@@ -158,20 +161,19 @@ class ScoreTD3(HybridOffPolicyAlgorithm, TD3):
         return {"inverting_gradients": self.inverting_gradients}
 
     def _setup_model(self) -> None:
+        initial = self.exploration_noise if self.exploration_initial_noise is None else self.exploration_initial_noise
+        self.exploration_noise_schedule = self._exploration_schedule(initial, self.exploration_noise)
         super()._setup_model()
-        if self.action_noise is None:
-            size = self.hybrid_space.shape[0]
-            self.action_noise = NormalActionNoise(np.zeros(size), np.full(size, self.exploration_noise))
 
     def learn(
-        self: SelfScoreTD3,
+        self: SelfHybridTD3,
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 4,
         tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
-    ) -> SelfScoreTD3:
+    ) -> SelfHybridTD3:
         return super().learn(
             total_timesteps=total_timesteps,
             callback=callback,

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs, ReplayBufferSamples
 
-from sb3_chdp.common.spaces import HybridBox
+from sb3_chdp.common.hybrid_box import HybridBox
 
 
 class HybridReplaySamples(NamedTuple):

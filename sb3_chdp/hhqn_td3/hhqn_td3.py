@@ -4,11 +4,11 @@ from typing import ClassVar
 
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_chdp.common.td3 import ScoreTD3
+from sb3_chdp.common.td3 import HybridTD3
 from sb3_chdp.hhqn_td3.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 
 
-class HHQNTD3(ScoreTD3):
+class HHQNTD3(HybridTD3):
     """
     Hierarchical Hybrid Q-Network with TD3 (HHQN-TD3), as a baseline of HyAR and CHDP
 
@@ -32,6 +32,8 @@ class HHQNTD3(ScoreTD3):
 
     :param exploration_noise: standard deviation of the Gaussian noise on scores and parameters, if no ``action_noise`` (of
         size K + P) is given
+    :param exploration_initial_noise: initial standard deviation, which falls linearly to ``exploration_noise`` over
+        ``exploration_fraction``; None: constant
     :param inverting_gradients: whether the gradients at the outputs of both actors are inverted
     :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
     :param exploration_fraction: fraction of the training over which the rate of uniformly random actions is reduced

@@ -4,13 +4,14 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN, create_mlp
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.td3.policies import Actor
 from torch import nn
 
-from sb3_chdp.common.spaces import ScoreBox
-from sb3_chdp.common.td3 import InvertingGradients, ScoreTD3Policy
+from sb3_chdp.common.hybrid_box import ScoreBox
+from sb3_chdp.common.policies import CnnFeatures, CombinedFeatures
+from sb3_chdp.common.td3 import HybridTD3Policy, InvertingGradients
 
 
 class HierarchicalActor(Actor):
@@ -53,8 +54,8 @@ class HierarchicalActor(Actor):
         return th.cat([scores, parameters], dim=1)
 
 
-class HHQNTD3Policy(ScoreTD3Policy):
-    """Policy class (with both actors and the critics) for HHQN-TD3, see :class:`ScoreTD3Policy`."""
+class HHQNTD3Policy(HybridTD3Policy):
+    """Policy class (with both actors and the critics) for HHQN-TD3, see :class:`HybridTD3Policy`."""
 
     actor: HierarchicalActor
 
@@ -74,15 +75,9 @@ class HHQNTD3Policy(ScoreTD3Policy):
 MlpPolicy = HHQNTD3Policy
 
 
-class CnnPolicy(HHQNTD3Policy):
-    """:class:`HHQNTD3Policy` for images: ``features_extractor_class`` is :class:`NatureCNN` by default."""
-
-    def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, **{"features_extractor_class": NatureCNN, **kwargs})
+class CnnPolicy(CnnFeatures, HHQNTD3Policy):
+    """:class:`HHQNTD3Policy` for images."""
 
 
-class MultiInputPolicy(HHQNTD3Policy):
-    """:class:`HHQNTD3Policy` for dict observations: ``features_extractor_class`` is :class:`CombinedExtractor` by default."""
-
-    def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, **{"features_extractor_class": CombinedExtractor, **kwargs})
+class MultiInputPolicy(CombinedFeatures, HHQNTD3Policy):
+    """:class:`HHQNTD3Policy` for dict observations."""

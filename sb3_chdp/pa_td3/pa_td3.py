@@ -4,11 +4,11 @@ from typing import ClassVar
 
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_chdp.common.td3 import ScoreTD3
+from sb3_chdp.common.td3 import HybridTD3
 from sb3_chdp.pa_td3.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 
 
-class PATD3(ScoreTD3):
+class PATD3(HybridTD3):
     """
     Parameterized Action TD3 (PA-TD3), PADDPG with TD3 in place of DDPG
 
@@ -31,6 +31,8 @@ class PATD3(ScoreTD3):
 
     :param exploration_noise: standard deviation of the Gaussian noise on scores and parameters, if no ``action_noise`` (of
         size K + P) is given
+    :param exploration_initial_noise: initial standard deviation, which falls linearly to ``exploration_noise`` over
+        ``exploration_fraction``; None: constant
     :param inverting_gradients: whether the gradients at the actor's output are inverted
     :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
     :param exploration_fraction: fraction of the training over which the rate of uniformly random actions is reduced
