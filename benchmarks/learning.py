@@ -29,7 +29,12 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_chdp
 
-ALGORITHMS = {"chdp": sb3_chdp.CHDP, "pa_td3": sb3_chdp.PATD3, "hhqn_td3": sb3_chdp.HHQNTD3}
+ALGORITHMS = {
+    "chdp": sb3_chdp.CHDP,
+    "pa_td3": sb3_chdp.PATD3,
+    "pdqn_td3": sb3_chdp.PDQNTD3,
+    "hhqn_td3": sb3_chdp.HHQNTD3,
+}
 ROOT = Path(__file__).parent
 FIELDS = ("timesteps", "gradient_steps", "success", "return", "length", "deterministic", "seconds")
 

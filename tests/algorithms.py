@@ -1,10 +1,10 @@
 """The algorithms that the shared tests run on, with small settings."""
 
-from sb3_chdp import CHDP, HHQNTD3, PATD3
+from sb3_chdp import CHDP, HHQNTD3, PATD3, PDQNTD3
 from tests.hybrid_envs import layouts
 
-ALGORITHMS = [CHDP, PATD3, HHQNTD3]
-SMALL = {CHDP: dict(n_diffusion_steps=2, n_action_candidates=2, latent_dim=3), PATD3: {}, HHQNTD3: {}}
+ALGORITHMS = [CHDP, PATD3, HHQNTD3, PDQNTD3]
+SMALL = {CHDP: dict(n_diffusion_steps=2, n_action_candidates=2, latent_dim=3), PATD3: {}, HHQNTD3: {}, PDQNTD3: {}}
 LAYOUTS = list(layouts())
 
 

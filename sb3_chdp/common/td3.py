@@ -44,14 +44,12 @@ class InvertingGradients(nn.Module):
 
 class HybridTD3Policy(HybridPolicy, TD3Policy):
     """
-    SB3's TD3 policy with an actor of K scores and P parameters; the action of highest score is taken.
+    SB3's TD3 policy on the rows of a hybrid action space.
 
     All arguments but one are those of :class:`stable_baselines3.td3.policies.TD3Policy`.
 
     :param inverting_gradients: whether to invert the gradients at the actor's output
     """
-
-    action_space: ScoreBox  # type: ignore[assignment]
 
     def __init__(self, *args: Any, inverting_gradients: bool = False, **kwargs: Any):
         self.inverting_gradients = inverting_gradients
@@ -69,7 +67,7 @@ class HybridTD3Policy(HybridPolicy, TD3Policy):
 
 class HybridTD3(HybridOffPolicyAlgorithm, TD3):
     """
-    Base class: SB3's TD3, its ``train()`` unchanged, on the space of scores and parameters.
+    Base class: SB3's TD3 on hybrid actions, by default on the space of K scores and P parameters.
 
     The parameters are those of :class:`stable_baselines3.TD3` and :class:`HybridOffPolicyAlgorithm`, and
 
