@@ -1,13 +1,21 @@
 """The algorithms that the shared tests run on, with small settings."""
 
-from sb3_chdp import CHDP, HHQNTD3, PATD3, PDQNTD3
+from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3, PDQNTD3, HyARTD3
 from tests.hybrid_envs import layouts
 
-ALGORITHMS = [CHDP, PATD3, HHQNTD3, PDQNTD3]
-SMALL = {CHDP: dict(n_diffusion_steps=2, n_action_candidates=2, latent_dim=3), PATD3: {}, HHQNTD3: {}, PDQNTD3: {}}
+OFF_POLICY = dict(batch_size=8, learning_starts=12, buffer_size=500)
+SMALL = {
+    CHDP: dict(OFF_POLICY, n_diffusion_steps=2, n_action_candidates=2, latent_dim=3),
+    PATD3: OFF_POLICY,
+    HHQNTD3: OFF_POLICY,
+    PDQNTD3: OFF_POLICY,
+    HyARTD3: dict(OFF_POLICY, embedding_dim=3, parameter_latent_dim=2, representation_warmup_steps=3, representation_freq=8),
+    HPPO: dict(n_steps=10, batch_size=5, n_epochs=2),
+}
+ALGORITHMS = list(SMALL)
+OFF_POLICY_ALGORITHMS = [algorithm for algorithm in ALGORITHMS if algorithm is not HPPO]
 LAYOUTS = list(layouts())
 
 
 def make_model(algorithm, env, policy="MlpPolicy", **kwargs):
-    settings = dict(batch_size=8, learning_starts=12, buffer_size=500, policy_kwargs=dict(net_arch=[8, 8]), seed=0)
-    return algorithm(policy, env, **{**settings, **SMALL[algorithm], **kwargs})
+    return algorithm(policy, env, **{"policy_kwargs": dict(net_arch=[8, 8]), "seed": 0, **SMALL[algorithm], **kwargs})

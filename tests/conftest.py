@@ -1,7 +1,7 @@
 import pytest
 import torch as th
 
-from tests.algorithms import ALGORITHMS
+from tests.algorithms import ALGORITHMS, OFF_POLICY_ALGORITHMS
 
 # Small networks: more threads are slower, and tests may run side by side
 th.set_num_threads(1)
@@ -9,4 +9,9 @@ th.set_num_threads(1)
 
 @pytest.fixture(params=ALGORITHMS, ids=lambda algorithm: algorithm.__name__)
 def algorithm(request):
+    return request.param
+
+
+@pytest.fixture(params=OFF_POLICY_ALGORITHMS, ids=lambda algorithm: algorithm.__name__)
+def off_policy_algorithm(request):
     return request.param

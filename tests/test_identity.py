@@ -5,7 +5,7 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_chdp import CHDP, HHQNTD3, PATD3, PDQNTD3
+from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3, PDQNTD3, HyARTD3
 from tests.hybrid_envs import HybridIdentityEnv
 
 # Uniformly random actions succeed in 9 % of the episodes; a policy that gets the action right and always
@@ -17,6 +17,15 @@ SETTINGS = {
         td3: dict(gradient_steps=8, learning_rate=1e-3, learning_starts=200, policy_kwargs=dict(net_arch=[64, 64]))
         for td3 in (PATD3, HHQNTD3, PDQNTD3)
     },
+    HyARTD3: dict(
+        gradient_steps=8,
+        learning_rate=1e-3,
+        learning_starts=1000,
+        representation_learning_rate=1e-3,
+        representation_warmup_steps=1000,
+        policy_kwargs=dict(net_arch=[64, 64]),
+    ),
+    HPPO: dict(n_steps=64, batch_size=64, learning_rate=1e-3),
 }
 
 

@@ -12,7 +12,7 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chdp import FlattenHybridAction
-from tests.algorithms import LAYOUTS, make_model
+from tests.algorithms import LAYOUTS, OFF_POLICY_ALGORITHMS, make_model
 from tests.hybrid_envs import make_layout_env
 
 OBS = np.random.default_rng(0).uniform(-1, 1, (20, 2)).astype(np.float32)
@@ -61,10 +61,10 @@ def test_set_parameters_and_policy_save(algorithm, tmp_path):
     same_predictions(model.policy, type(model.policy).load(tmp_path / "policy"))
 
 
-def test_replay_buffer(algorithm, tmp_path):
-    model = make_model(algorithm, make_layout_env()).learn(30)
+def test_replay_buffer(off_policy_algorithm, tmp_path):
+    model = make_model(off_policy_algorithm, make_layout_env()).learn(30)
     model.save_replay_buffer(tmp_path / "buffer")
-    other = make_model(algorithm, make_layout_env())
+    other = make_model(off_policy_algorithm, make_layout_env())
     other.load_replay_buffer(tmp_path / "buffer")
     assert other.replay_buffer.size() == model.replay_buffer.size()
     np.testing.assert_array_equal(other.replay_buffer.actions, model.replay_buffer.actions)
@@ -72,9 +72,12 @@ def test_replay_buffer(algorithm, tmp_path):
 
 
 def test_continued_learning_equals_learning_at_once(algorithm):
+    constant = {}
+    if algorithm in OFF_POLICY_ALGORITHMS:  # by default they explore less towards the end
+        constant = dict(exploration_initial_eps=0.3, exploration_final_eps=0.3)
     runs = []
     for parts in ((60,), (30, 30)):
-        model = make_model(algorithm, make_layout_env(), exploration_initial_eps=0.3, exploration_final_eps=0.3)
+        model = make_model(algorithm, make_layout_env(), **constant)
         for part in parts:
             model.learn(part, reset_num_timesteps=False)
         assert model.num_timesteps == 60

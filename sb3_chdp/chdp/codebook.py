@@ -4,6 +4,8 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_chdp.common.utils import nearest_row
+
 
 class Codebook(nn.Module):
     """
@@ -23,9 +25,7 @@ class Codebook(nn.Module):
         :param latents: (B, d_e)
         :return: (B,) index k of the nearest codeword in squared Euclidean distance
         """
-        codewords = self.codewords.detach()
-        # |e - c|^2 without |e|^2, which is the same for all codewords
-        return th.addmm(codewords.square().sum(dim=1), latents.detach(), codewords.t(), alpha=-2).argmin(dim=1)
+        return nearest_row(latents.detach(), self.codewords.detach())
 
     def forward(self, k: th.Tensor) -> th.Tensor:
         """

@@ -83,12 +83,6 @@ class ConcatenatedBox(HybridBox):
         rows[:, self.parameter_columns] = rng.uniform(-1.0, 1.0, (n, self.spec.n_parameters))
         return rows
 
-    def add_noise(self, rows: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """:return: the rows with (n, P) noise on the parameters of all actions, clipped"""
-        rows = rows.copy()
-        rows[:, self.parameter_columns] = np.clip(rows[:, self.parameter_columns] + noise, -1, 1)
-        return rows
-
 
 class ScoreBox(HybridBox):
     """
@@ -111,10 +105,6 @@ class ScoreBox(HybridBox):
     def sample_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """:return: (n, K + P) uniform scores and parameters; every discrete action is as likely as the others"""
         return rng.uniform(-1.0, 1.0, (n, *self.shape)).astype(np.float32)
-
-    def add_noise(self, rows: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """:return: scores and parameters with (n, K + P) noise, clipped"""
-        return np.clip(rows + noise, -1, 1).astype(np.float32)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return ScoreBox, (self.native, self.spec.layout)

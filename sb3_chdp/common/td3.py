@@ -2,11 +2,12 @@
 
 from typing import Any, TypeVar
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
 from stable_baselines3.td3 import TD3
 from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
@@ -60,6 +61,18 @@ class HybridTD3Policy(HybridPolicy, TD3Policy):
         if self.inverting_gradients:
             actor.mu = nn.Sequential(*actor.mu, InvertingGradients())
         return actor
+
+    def noisy_rows(self, observation: np.ndarray | dict[str, np.ndarray], noise: np.ndarray) -> np.ndarray:
+        self.set_training_mode(False)
+        obs_tensor, _ = self.obs_to_tensor(observation)
+        with th.no_grad():
+            # One environment: the noise has no batch dimension
+            noise_tensor = th.as_tensor(noise, dtype=th.float32, device=self.device).view(-1, self.noise_dim)
+            return self._noisy_rows(obs_tensor, noise_tensor).cpu().numpy()
+
+    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor) -> th.Tensor:
+        """:return: rows of the actor with (n, noise_dim) noise on its output"""
+        return (self.actor(obs) + noise).clamp(-1, 1)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "inverting_gradients": self.inverting_gradients}

@@ -21,6 +21,16 @@ def polyak_update(params: Iterable[th.Tensor], target_params: Iterable[th.Tensor
         th._foreach_lerp_(list(target_params), list(params), tau)
 
 
+def nearest_row(points: th.Tensor, table: th.Tensor) -> th.Tensor:
+    """
+    :param points: (B, d)
+    :param table: (K, d)
+    :return: (B,) index of the row of the table that is nearest in Euclidean distance
+    """
+    # |p - t|^2 without |p|^2, which is the same for all rows
+    return th.addmm(table.square().sum(dim=1), points, table.t(), alpha=-2).argmin(dim=1)
+
+
 def hash_observations(observations: PyTorchObs) -> th.Tensor:
     """
     :param observations: batch of observations

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
@@ -63,13 +62,8 @@ class HHQNTD3Policy(HybridTD3Policy):
         actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
         return HierarchicalActor(**actor_kwargs, inverting_gradients=self.inverting_gradients).to(self.device)
 
-    def noisy_rows(self, observation: np.ndarray | dict[str, np.ndarray], noise: np.ndarray) -> np.ndarray:
-        self.set_training_mode(False)
-        obs_tensor, _ = self.obs_to_tensor(observation)
-        with th.no_grad():
-            # One environment: the noise has no batch dimension
-            noise_tensor = th.as_tensor(noise, dtype=th.float32, device=self.device).view(-1, *self.action_space.shape)
-            return self.actor(obs_tensor, noise_tensor).cpu().numpy()
+    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor) -> th.Tensor:
+        return self.actor(obs, noise)
 
 
 MlpPolicy = HHQNTD3Policy

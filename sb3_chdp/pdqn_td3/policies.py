@@ -202,6 +202,11 @@ class PDQNTD3Policy(HybridTD3Policy):
         q1, _ = self.critic(self.critic.features(observation), parameters)
         return th.cat([q1.argmax(dim=1, keepdim=True), parameters], dim=1)
 
+    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor) -> th.Tensor:
+        rows = self._predict(obs)
+        # k is the best action for the parameters without noise
+        return th.cat([rows[:, :1], (rows[:, 1:] + noise).clamp(-1, 1)], dim=1)
+
     @property
     def noise_dim(self) -> int:
         return self.action_space.spec.n_parameters

@@ -1,0 +1,95 @@
+"""The distribution of hybrid actions: a categorical choice and a Gaussian over the parameters of all actions."""
+
+from typing import TypeVar
+
+import torch as th
+from sb3_contrib.common.maskable.distributions import MaskableCategoricalDistribution, MaybeMasks
+from stable_baselines3.common.distributions import DiagGaussianDistribution
+from torch import nn
+
+from sb3_chdp.common.hybrid_box import ConcatenatedBox
+
+SelfHybridDistribution = TypeVar("SelfHybridDistribution", bound="HybridDistribution")
+
+
+class HybridDistribution(DiagGaussianDistribution):
+    """
+    A categorical distribution of k beside a diagonal Gaussian of the P parameters of all actions.
+
+    Only the parameters of the chosen action enter the density: the others are not executed. Actions are rows
+    ``[k | scaled parameters of all actions | mask of the K actions]``; the mask is there if the space has the columns.
+
+    :param action_space: space of the action rows
+    """
+
+    def __init__(self, action_space: ConcatenatedBox):
+        spec = action_space.spec
+        super().__init__(spec.n_parameters)
+        self.n_discrete_actions = spec.n_discrete_actions
+        self.has_mask_columns = action_space.latent_dim > 0
+        self.categorical = MaskableCategoricalDistribution(spec.n_discrete_actions)
+        self._parameter_index = th.tensor(spec.parameter_index)
+        self._parameter_mask = th.tensor(spec.mask, dtype=th.float32)
+
+    def proba_distribution_net(self, latent_dim: int, log_std_init: float = 0.0) -> tuple[nn.Module, nn.Parameter]:
+        """
+        :param latent_dim: dimension of the last layer of the policy
+        :param log_std_init: initial value of the log standard deviation
+        :return: layer of the K logits and P means, (P,) log standard deviation
+        """
+        _, log_std = super().proba_distribution_net(latent_dim, log_std_init)
+        return nn.Linear(latent_dim, self.n_discrete_actions + self.action_dim), log_std
+
+    def proba_distribution(
+        self: SelfHybridDistribution, mean_actions: th.Tensor, log_std: th.Tensor
+    ) -> SelfHybridDistribution:
+        """
+        :param mean_actions: (B, K + P) logits and means
+        :param log_std: (P,) log standard deviation
+        :return: self
+        """
+        logits, means = mean_actions.split([self.n_discrete_actions, self.action_dim], dim=1)
+        self.categorical.proba_distribution(logits)
+        return super().proba_distribution(means, log_std)
+
+    def apply_masking(self, masks: MaybeMasks) -> None:
+        """
+        :param masks: (B, K) False for discrete actions that may not be taken; None removes a former mask
+        """
+        self.categorical.apply_masking(masks)
+
+    def log_prob(self, actions: th.Tensor) -> th.Tensor:
+        """
+        :param actions: (B, columns) rows; their mask, if they have one, is applied
+        :return: (B, 2) log-probability of k, log-density of the parameters of k (0 if it has none)
+        """
+        k, parameters, masks = self._split(actions)
+        if self.has_mask_columns:
+            self.apply_masking(masks)
+        index = self._parameter_index.to(k.device)[k]
+        log_densities = self.distribution.log_prob(parameters).gather(1, index)
+        own = self._parameter_mask.to(k.device)[k]
+        return th.stack([self.categorical.log_prob(k), (log_densities * own).sum(dim=1)], dim=1)
+
+    def _split(self, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        first, last = 1, 1 + self.action_dim
+        return actions[:, 0].long(), actions[:, first:last], actions[:, last:]
+
+    def entropy(self) -> th.Tensor:
+        """:return: (B,) entropy of the categorical distribution; the Gaussian's is not part of HPPO's objective"""
+        return self.categorical.entropy()
+
+    def sample(self) -> th.Tensor:
+        """:return: (B, columns) rows"""
+        return self._rows(self.categorical.sample(), super().sample())
+
+    def mode(self) -> th.Tensor:
+        """:return: (B, columns) rows of the most probable k and the means"""
+        return self._rows(self.categorical.mode(), super().mode())
+
+    def _rows(self, k: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+        parts = [k[:, None].float(), parameters]
+        if self.has_mask_columns:
+            masks = self.categorical.distribution.masks
+            parts.append(th.ones(len(k), self.n_discrete_actions).to(k.device) if masks is None else masks.float())
+        return th.cat(parts, dim=1)

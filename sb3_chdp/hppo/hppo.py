@@ -1,0 +1,211 @@
+"""Hybrid proximal policy optimization."""
+
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from sb3_contrib.common.maskable.utils import is_masking_supported
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
+from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox
+from sb3_chdp.common.on_policy_algorithm import HybridDictRolloutBuffer, HybridRolloutBuffer, NativeActionVecEnv
+from sb3_chdp.common.utils import check_finite
+from sb3_chdp.hppo.policies import CnnPolicy, HPPOPolicy, MlpPolicy, MultiInputPolicy
+
+SelfHPPO = TypeVar("SelfHPPO", bound="HPPO")
+
+
+class HPPO(HybridAlgorithm, PPO):
+    """
+    Hybrid Proximal Policy Optimization (HPPO)
+
+    A categorical policy chooses the discrete action, a Gaussian policy the parameters; each has its own clipped ratio.
+    SB3's ``PPO.train()`` is used as it is: log-probabilities, and so ratios, have two columns.
+
+    Paper: Fan et al. (2019), https://arxiv.org/abs/1903.01344. Reference scripts: HyAR repository.
+
+    Differences from the reference scripts:
+        1. the log-probability of the action taken (there: the highest probability of all actions);
+        2. only the parameters of the executed action enter the density (there: those of all actions);
+        3. unclipped samples are stored, and clipped for the environment only (there: before the density is computed);
+        4. PPO's advantages and returns: a terminal state is worth 0, a time limit bootstraps (there: the last reward is
+           counted twice, and advantages run on into the next episode);
+        5. evaluation with the most probable action and its mean parameters (there: sampled);
+        6. one optimizer, entropy bonus for the discrete action, minibatches and their number as in PPO;
+        7. linear means (there tanh), one log standard deviation per parameter (there the sum of ten);
+        8. the mean over both heads of the clipped loss (there: the sum), which is the sum with ``ent_coef`` and
+           ``vf_coef`` twice as large;
+        9. a mask of the discrete actions, if the environment has ``action_masks()``.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
+    :param env: The environment to learn from (if registered in Gym, can be str), with a hybrid action space
+    :param learning_rate: The learning rate, it can be a function
+        of the current progress remaining (from 1 to 0)
+    :param n_steps: The number of steps to run for each environment per update
+        (i.e. rollout buffer size is n_steps * n_envs where n_envs is number of environment copies running in parallel)
+    :param batch_size: Minibatch size, at least 2
+    :param n_epochs: Number of epoch when optimizing the surrogate loss
+    :param gamma: Discount factor
+    :param gae_lambda: Factor for trade-off of bias vs variance for Generalized Advantage Estimator
+    :param clip_range: Clipping parameter of both heads, it can be a function of the current progress
+        remaining (from 1 to 0).
+    :param clip_range_vf: Clipping parameter for the value function, see :class:`stable_baselines3.PPO`
+    :param normalize_advantage: Whether to normalize or not the advantage
+    :param ent_coef: Entropy coefficient of the discrete action for the loss calculation
+    :param vf_coef: Value function coefficient for the loss calculation
+    :param max_grad_norm: The maximum value for the gradient clipping
+    :param rollout_buffer_class: Rollout buffer class to use, a :class:`HybridRolloutBuffer` or
+        :class:`HybridDictRolloutBuffer`. If ``None``, it will be automatically selected.
+    :param rollout_buffer_kwargs: Keyword arguments to pass to the rollout buffer on creation
+    :param target_kl: Limit the KL divergence between updates, the mean over both heads
+    :param use_masking: whether to ask the environment for ``action_masks()``, (K,) boolean, over the joint index if there
+        are several discrete parts; None: if it has such a method
+    :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
+    :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
+        the reported success rate, mean episode length, and mean reward over
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param policy_kwargs: additional arguments to be passed to the policy on creation, see :class:`HPPOPolicy`
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for
+        debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run.
+        Setting it to auto, the code will be run on the GPU if possible.
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    policy: HPPOPolicy
+
+    def __init__(
+        self,
+        policy: str | type[HPPOPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        n_steps: int = 2048,
+        batch_size: int = 64,
+        n_epochs: int = 10,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        clip_range: float | Schedule = 0.2,
+        clip_range_vf: float | Schedule | None = None,
+        normalize_advantage: bool = True,
+        ent_coef: float = 0.01,
+        vf_coef: float = 0.5,
+        max_grad_norm: float = 0.5,
+        rollout_buffer_class: type[RolloutBuffer] | None = None,
+        rollout_buffer_kwargs: dict[str, Any] | None = None,
+        target_kl: float | None = None,
+        use_masking: bool | None = None,
+        action_layout: str = "auto",
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        # Not PPO's, which refuses hybrid action spaces
+        OnPolicyAlgorithm.__init__(
+            self,
+            policy,
+            env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            ent_coef=ent_coef,
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,
+            use_sde=False,
+            sde_sample_freq=-1,
+            rollout_buffer_class=rollout_buffer_class,
+            rollout_buffer_kwargs=rollout_buffer_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            _init_setup_model=False,
+            supported_action_spaces=HYBRID_SPACES,
+        )
+        if batch_size < 2:
+            raise ValueError(f"batch_size must be at least 2 for the normalization of advantages, got {batch_size}")
+        self.batch_size = batch_size
+        self.n_epochs = n_epochs
+        self.clip_range = clip_range
+        self.clip_range_vf = clip_range_vf
+        self.normalize_advantage = normalize_advantage
+        self.target_kl = target_kl
+        self.action_layout = action_layout
+        if use_masking is None:
+            use_masking = self.env is not None and is_masking_supported(self.env)
+        self.use_masking = use_masking
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _make_hybrid_space(self) -> HybridBox:
+        box = ConcatenatedBox(self.action_space, self.action_layout)
+        # The masks are stored behind the parameters
+        return ConcatenatedBox(self.action_space, self.action_layout, box.spec.n_discrete_actions) if self.use_masking else box
+
+    def _setup_model(self) -> None:
+        if self.rollout_buffer_class is None:
+            is_dict = isinstance(self.observation_space, spaces.Dict)
+            self.rollout_buffer_class = HybridDictRolloutBuffer if is_dict else HybridRolloutBuffer
+        super()._setup_model()
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        if self.use_masking and not is_masking_supported(env):
+            raise ValueError("use_masking is True but the environment has no method action_masks()")
+        check_finite("The observation", self._last_obs)  # type: ignore[arg-type]
+        set_action_masks = self.policy.set_action_masks if self.use_masking else None
+        native_env = NativeActionVecEnv(env, self.hybrid_space, set_action_masks)
+        try:
+            return super().collect_rollouts(native_env, callback, rollout_buffer, n_rollout_steps)
+        finally:
+            self.policy.set_action_masks(None)
+
+    def predict(  # type: ignore[override]
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+        action_masks: np.ndarray | None = None,
+    ) -> tuple[Any, tuple[np.ndarray, ...] | None]:
+        return self.policy.predict(observation, state, episode_start, deterministic, action_masks)
+
+    def learn(
+        self: SelfHPPO,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "HPPO",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfHPPO:
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )

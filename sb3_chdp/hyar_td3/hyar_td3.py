@@ -1,0 +1,256 @@
+"""TD3 in the latent space of HyAR's action representation."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
+from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
+
+from sb3_chdp.common.hybrid_box import HybridBox
+from sb3_chdp.common.td3 import HybridTD3
+from sb3_chdp.common.type_aliases import name_columns
+from sb3_chdp.hyar_td3.policies import CnnPolicy, HyARTD3Policy, MlpPolicy, MultiInputPolicy
+from sb3_chdp.hyar_td3.representation import ActionBatch
+
+# Size of the sample that the latent bounds are fitted to
+BOUNDS_SAMPLE = 5000
+
+
+class LatentReplay:
+    """
+    The replay buffer as TD3 sees it: its actions are latents under the present representation.
+
+    :param model: the algorithm whose buffer it is
+    """
+
+    def __init__(self, model: "HyARTD3"):
+        assert model.replay_buffer is not None
+        self.model, self.replay_buffer = model, model.replay_buffer
+        self.kept: list[th.Tensor] = []
+
+    def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
+        replay_data = self.replay_buffer.sample(batch_size, env=env)
+        batch, latents = self.model._action_batch(replay_data)
+        latents, kept = self.model.policy.representation.relabel(batch, latents)
+        self.kept.append(kept.float().mean(dim=0))
+        return replay_data._replace(actions=latents)
+
+
+class HyARTD3(HybridTD3):
+    """
+    TD3 on Hybrid Action Representations (HyAR-TD3)
+
+    Discrete actions are embedded by a table, parameters by a conditional VAE that also predicts the change of the state;
+    TD3 acts in the space of both. The representation is trained on the first ``learning_starts`` steps, which are random,
+    and further on all data; stored latents are checked, and replaced if they have lost their meaning.
+
+    Paper: Li et al. (2022), https://arxiv.org/abs/2109.05490. Reference scripts: HyAR repository.
+
+    Differences from the reference scripts:
+        1. the random steps that train the representation count as ``num_timesteps``, and are learnt from by TD3 too (there
+           they are extra: 5000 or 20000 episodes); one buffer serves both;
+        2. the buffer holds z as it was decoded (there scaled to bounds that move on later), and the check of stored latents
+           decodes that z (there the scaled one);
+        3. one Adam for the representation (there a new one for every batch);
+        4. relabelled z are the encoder's means (there samples); log standard deviations in [-4, 4] (there up to 15);
+        5. parameters that an action does not have are no targets of the reconstruction;
+        6. latent bounds have a least width;
+        7. ``representation_steps`` batches every ``representation_freq`` gradient steps (there one batch per ten episodes);
+        8. uniformly random actions with a decreasing probability (``exploration_*``) instead of noise that falls from 1.0
+           to 0.1 (``exploration_initial_noise=1.0`` and initial and final rate 0: the scripts);
+        9. plain policy gradients; ``inverting_gradients=True`` for inverted ones; no clipping of gradient norms, no
+           additional update per episode.
+
+    With n-step returns the representation predicts the change of the state over n steps. Observations other than vectors
+    are represented by the features of the target critic.
+
+    The parameters are those of :class:`stable_baselines3.TD3`, and
+
+    :param embedding_dim: width of the embedding of a discrete action
+    :param parameter_latent_dim: width of the latent z of the parameters
+    :param representation_learning_rate: learning rate of the representation
+    :param representation_batch_size: its minibatch size
+    :param representation_warmup_steps: its gradient steps before TD3 begins
+    :param representation_freq: it is updated again every ``representation_freq`` gradient steps of TD3
+    :param representation_steps: number of its gradient steps then
+    :param exploration_noise: standard deviation of the Gaussian noise on the latents, if no ``action_noise`` (of size
+        ``embedding_dim + parameter_latent_dim``) is given
+    :param exploration_initial_noise: initial standard deviation, which falls linearly to ``exploration_noise`` over
+        ``exploration_fraction``; None: constant
+    :param inverting_gradients: whether the gradients at the actor's output are inverted
+    :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
+    :param exploration_fraction: fraction of the training over which the rate of uniformly random actions is reduced
+    :param exploration_initial_eps: initial probability of a uniformly random action
+    :param exploration_final_eps: final probability of a uniformly random action
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    policy: HyARTD3Policy
+
+    def __init__(
+        self,
+        policy: str | type[HyARTD3Policy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 1_000_000,  # 1e6
+        learning_starts: int = 5000,
+        batch_size: int = 128,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        policy_delay: int = 2,
+        target_policy_noise: float = 0.1,
+        target_noise_clip: float = 0.5,
+        embedding_dim: int = 6,
+        parameter_latent_dim: int = 6,
+        representation_learning_rate: float | Schedule = 1e-4,
+        representation_batch_size: int = 64,
+        representation_warmup_steps: int = 5000,
+        representation_freq: int = 500,
+        representation_steps: int = 5,
+        exploration_noise: float = 0.1,
+        exploration_initial_noise: float | None = None,
+        inverting_gradients: bool = False,
+        action_layout: str = "auto",
+        exploration_fraction: float = 0.2,
+        exploration_initial_eps: float = 1.0,
+        exploration_final_eps: float = 0.05,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            policy_delay=policy_delay,
+            target_policy_noise=target_policy_noise,
+            target_noise_clip=target_noise_clip,
+            exploration_noise=exploration_noise,
+            exploration_initial_noise=exploration_initial_noise,
+            inverting_gradients=inverting_gradients,
+            action_layout=action_layout,
+            exploration_fraction=exploration_fraction,
+            exploration_initial_eps=exploration_initial_eps,
+            exploration_final_eps=exploration_final_eps,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        for name, value in (("embedding_dim", embedding_dim), ("parameter_latent_dim", parameter_latent_dim)):
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        self.embedding_dim = embedding_dim
+        self.parameter_latent_dim = parameter_latent_dim
+        self.representation_learning_rate = representation_learning_rate
+        self.representation_batch_size = representation_batch_size
+        self.representation_warmup_steps = representation_warmup_steps
+        self.representation_freq = representation_freq
+        self.representation_steps = representation_steps
+        # Number of gradient steps of TD3 at which the representation is updated next; the first time it is warmed up
+        self._next_representation_update = 0
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _make_hybrid_space(self) -> HybridBox:
+        return HybridBox(self.action_space, self.action_layout, self.embedding_dim + self.parameter_latent_dim)
+
+    def _network_kwargs(self) -> dict[str, Any]:
+        return {**super()._network_kwargs(), "embedding_dim": self.embedding_dim}
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.representation_lr_schedule = FloatSchedule(self.representation_learning_rate)
+
+    def train(self, gradient_steps: int, batch_size: int = 128) -> None:
+        if self._n_updates >= self._next_representation_update:
+            warm_up = self._next_representation_update == 0
+            self._train_representation(self.representation_warmup_steps if warm_up else self.representation_steps)
+            self._next_representation_update = self._n_updates + self.representation_freq
+        with self._latent_replay() as replay:
+            super().train(gradient_steps, batch_size)
+        kept_embeddings, kept_z = th.stack(replay.kept).mean(dim=0).tolist()
+        self.logger.record("train/kept_embeddings", kept_embeddings)
+        self.logger.record("train/kept_parameter_latents", kept_z)
+
+    @contextmanager
+    def _latent_replay(self) -> Iterator[LatentReplay]:
+        """Let TD3's ``train()`` sample latents in place of the stored rows."""
+        stored = self.replay_buffer
+        replay = LatentReplay(self)
+        self.replay_buffer = replay  # type: ignore[assignment]
+        try:
+            yield replay
+        finally:
+            self.replay_buffer = stored
+
+    def _action_batch(self, replay_data: ReplayBufferSamples) -> tuple[ActionBatch, th.Tensor]:
+        """:return: what the representation needs to know of a batch, and its (B, d1 + d2) stored latents"""
+        data = name_columns(replay_data, self.hybrid_space, self.gamma)
+        features = self.policy.state_features(data.observations)
+        changes = self.policy.state_features(data.next_observations) - features
+        return ActionBatch(features, data.discrete_actions, data.parameters, changes), data.latents
+
+    def _sample_actions(self, batch_size: int) -> ActionBatch:
+        assert self.replay_buffer is not None
+        return self._action_batch(self.replay_buffer.sample(batch_size, env=self._vec_normalize_env))[0]
+
+    def _train_representation(self, gradient_steps: int) -> None:
+        """
+        Update the representation on stored transitions, and its latent bounds after that.
+
+        :param gradient_steps: number of updates
+        """
+        optimizer, representation = self.policy.representation_optimizer, self.policy.representation
+        update_learning_rate(optimizer, self.representation_lr_schedule(self._current_progress_remaining))
+        losses = []
+        for _ in range(gradient_steps):
+            loss = representation.loss(self._sample_actions(self.representation_batch_size))
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            losses.append(loss.item())
+        representation.update_bounds(self._sample_actions(BOUNDS_SAMPLE))
+        self.logger.record("train/representation_loss", np.mean(losses[-100:]))
+        self.logger.record("train/representation_error", representation.usual_error.item())
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, tensors = super()._get_torch_save_params()
+        return [*state_dicts, "policy.representation_optimizer"], tensors

@@ -1,0 +1,99 @@
+"""Policies of HyAR-TD3: a TD3 policy in the latent space of an action representation."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+
+from sb3_chdp.common.hybrid_box import HybridBox
+from sb3_chdp.common.policies import CnnFeatures, CombinedFeatures
+from sb3_chdp.common.td3 import HybridTD3Policy
+from sb3_chdp.hyar_td3.representation import ActionRepresentation
+
+
+class HyARTD3Policy(HybridTD3Policy):
+    """
+    Policy class (with actor, critic and action representation) for HyAR-TD3.
+
+    Actor and critic work on latents in [-1, 1]. The representation sees the features of the target critic, which are the
+    observation itself for vectors. The arguments are those of :class:`HybridTD3Policy`, and
+
+    :param embedding_dim: width of the embedding of a discrete action
+    :param representation_hidden_dim: units of the hidden layers of the representation
+    """
+
+    action_space: HybridBox
+
+    def __init__(self, *args: Any, embedding_dim: int = 6, representation_hidden_dim: int = 256, **kwargs: Any):
+        self.embedding_dim = embedding_dim
+        self.representation_hidden_dim = representation_hidden_dim
+        super().__init__(*args, **kwargs)
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        latent_dim = self.action_space.latent_dim
+        latent_space = spaces.Box(-1.0, 1.0, (latent_dim,), dtype=np.float32)
+        self.actor_kwargs["action_space"] = self.critic_kwargs["action_space"] = latent_space
+        super()._build(lr_schedule)
+        self.representation = ActionRepresentation(
+            self.critic_target.features_extractor.features_dim,
+            th.tensor(self.action_space.spec.mask),
+            self.embedding_dim,
+            latent_dim - self.embedding_dim,
+            self.representation_hidden_dim,
+        )
+        self.representation_optimizer = self.optimizer_class(
+            self.representation.parameters(),
+            lr=lr_schedule(1),  # type: ignore[call-arg]  # set before every update
+            **self.optimizer_kwargs,
+        )
+
+    def state_features(self, obs: PyTorchObs) -> th.Tensor:
+        """:return: (B, features_dim) features for the representation, without gradient"""
+        with th.no_grad():
+            return self.critic_target.extract_features(obs, self.critic_target.features_extractor)
+
+    def decode(self, obs: PyTorchObs, latents: th.Tensor) -> th.Tensor:
+        """
+        :param obs: observations
+        :param latents: (B, latent_dim) in [-1, 1]
+        :return: (B, columns) rows, with z not scaled: bounds may change before it is used
+        """
+        embeddings, scaled_z = latents[:, : self.embedding_dim], latents[:, self.embedding_dim :]
+        k = self.representation.nearest_action(embeddings)
+        z = self.representation.unscale(scaled_z)
+        parameters, _ = self.representation.decode(self.state_features(obs), k, z)
+        return th.cat([k[:, None].float(), parameters, embeddings, z], dim=1)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """:return: (B, columns) rows"""
+        return self.decode(observation, self.actor(observation))
+
+    @property
+    def noise_dim(self) -> int:
+        return self.action_space.latent_dim
+
+    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor) -> th.Tensor:
+        return self.decode(obs, (self.actor(obs) + noise).clamp(-1, 1))
+
+    def random_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Uniformly random actions; their latents are unknown (NaN) until they are looked at by the representation."""
+        rows = super().random_rows(rng, n)
+        rows[:, self.action_space.spec.row_size :] = np.nan
+        return rows
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        own = dict(embedding_dim=self.embedding_dim, representation_hidden_dim=self.representation_hidden_dim)
+        return {**super()._get_constructor_parameters(), **own}
+
+
+MlpPolicy = HyARTD3Policy
+
+
+class CnnPolicy(CnnFeatures, HyARTD3Policy):
+    """:class:`HyARTD3Policy` for images."""
+
+
+class MultiInputPolicy(CombinedFeatures, HyARTD3Policy):
+    """:class:`HyARTD3Policy` for dict observations."""
