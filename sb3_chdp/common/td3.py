@@ -23,7 +23,7 @@ class _InvertGradient(th.autograd.Function):
     @staticmethod
     def forward(ctx: Any, actions: th.Tensor) -> th.Tensor:
         ctx.save_for_backward(actions)
-        return actions.view_as(actions)
+        return actions.clamp(-1, 1)
 
     @staticmethod
     def backward(ctx: Any, gradient: th.Tensor) -> th.Tensor:  # type: ignore[override]
@@ -35,7 +35,7 @@ class _InvertGradient(th.autograd.Function):
 
 class InvertingGradients(nn.Module):
     """
-    Identity whose gradient shrinks as an action in [-1, 1] approaches the bound that it is pushed to, and turns back beyond
+    Clamp to [-1, 1] whose gradient shrinks as an action approaches the bound that it is pushed to, and turns back beyond
     it (Hausknecht and Stone, 2016).
     """
 

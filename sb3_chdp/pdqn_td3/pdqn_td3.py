@@ -54,7 +54,7 @@ class PDQNTD3(HybridTD3):
         P) is given
     :param exploration_initial_noise: initial standard deviation, which falls linearly to ``exploration_noise`` over
         ``exploration_fraction``; None: constant
-    :param inverting_gradients: True: the actor's outputs are linear and kept in [-1, 1] by inverted gradients and a clamp;
+    :param inverting_gradients: True: the actor's outputs are linear and clamped to [-1, 1], with inverted gradients;
         False: tanh and plain gradients
     :param multi_pass: whether Q of an action sees the parameters of that action only (MP-DQN)
     :param passthrough: ``dict(weight=..., bias=...)`` of a fixed linear function of the observation that is added to the

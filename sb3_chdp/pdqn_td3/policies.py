@@ -22,7 +22,7 @@ class ParameterActor(Actor):
 
     The arguments are those of SB3's TD3 actor, and
 
-    :param inverting_gradients: True: linear outputs, kept in [-1, 1] by inverted gradients and a clamp; False: tanh
+    :param inverting_gradients: True: linear outputs, clamped to [-1, 1], with inverted gradients; False: tanh
     :param passthrough: ``dict(weight=..., bias=...)`` of a fixed linear function of the features that is added to the
         linear outputs, (P, features_dim) and (P,), either may be missing
     """
@@ -41,7 +41,7 @@ class ParameterActor(Actor):
         n_parameters = self.action_space.shape[0]  # type: ignore[index]
         self.inverting_gradients = inverting_gradients
         self.mu = nn.Sequential(*create_mlp(self.features_dim, n_parameters, self.net_arch, self.activation_fn))
-        self.squash = nn.Sequential(InvertingGradients(), nn.Hardtanh()) if inverting_gradients else nn.Tanh()
+        self.squash = InvertingGradients() if inverting_gradients else nn.Tanh()
         for name, shape in (("weight", (n_parameters, self.features_dim)), ("bias", (n_parameters,))):
             values = th.as_tensor((passthrough or {}).get(name, th.zeros(shape)), dtype=th.float32)
             if values.shape != shape:

@@ -1,0 +1,140 @@
+"""What is particular to HPPO: two ratios, masked densities, action masks."""
+
+import numpy as np
+import pytest
+import torch as th
+from sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_masked_policy
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from torch.distributions import Categorical, Normal
+
+from sb3_chdp import HPPO
+from sb3_chdp.common.distributions import HybridDistribution
+from sb3_chdp.common.hybrid_box import ConcatenatedBox
+from tests.algorithms import LAYOUTS, make_model
+from tests.hybrid_envs import LayoutEnv, layouts, make_layout_env
+
+
+class MaskedEnv(LayoutEnv):
+    """Allows one discrete action at a time, which it tells by ``action_masks()`` only."""
+
+    def __init__(self):
+        super().__init__(layouts()["nested"])
+        self.allowed = 0
+
+    def action_masks(self):
+        return np.arange(3) == self.allowed
+
+    def step(self, action):
+        if action[0] != self.allowed:
+            raise ValueError(f"{action[0]} is masked, only {self.allowed} is not")
+        self.allowed = int(self.np_random.integers(3))
+        return super().step(action)
+
+
+def distribution_of(layout, batch_size=6):
+    space = ConcatenatedBox(layouts()[layout])
+    distribution = HybridDistribution(space)
+    size = space.spec.n_discrete_actions + space.spec.n_parameters
+    outputs = th.randn(batch_size, size, requires_grad=True)
+    log_std = th.full((space.spec.n_parameters,), -0.5, requires_grad=True)
+    return space, distribution.proba_distribution(outputs, log_std), outputs, log_std
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_log_prob_against_a_slow_loop(layout):
+    space, distribution, outputs, log_std = distribution_of(layout)
+    spec = space.spec
+    rows = distribution.sample()
+    logits, means = outputs[:, : spec.n_discrete_actions], outputs[:, spec.n_discrete_actions :]
+    log_prob = distribution.log_prob(rows)
+    for i, row in enumerate(rows):
+        k = int(row[0])
+        density = 0.0
+        for j in spec.parameter_index[k][spec.mask[k]]:
+            density += Normal(means[i, j], log_std[j].exp()).log_prob(row[1 + j])
+        assert log_prob[i, 0].item() == pytest.approx(Categorical(logits=logits[i]).log_prob(row[0]).item(), abs=1e-5)
+        assert log_prob[i, 1].item() == pytest.approx(th.as_tensor(density).item(), abs=1e-5)
+    np.testing.assert_allclose(distribution.entropy().detach(), Categorical(logits=logits).entropy().detach(), atol=1e-6)
+    assert (distribution.mode()[:, 0] == logits.argmax(dim=1)).all()
+
+
+def test_parameters_of_other_actions_get_no_gradient():
+    space, distribution, outputs, log_std = distribution_of("nested")
+    rows = distribution.sample().detach()
+    distribution.log_prob(rows)[:, 1].sum().backward()
+    owners = np.array([0, 0, 1])  # the third action has no parameters
+    for i, k in enumerate(rows[:, 0].long()):
+        gradients = outputs.grad[i, 3:]
+        assert ((gradients != 0).numpy() == (owners == int(k))).all()
+        assert (outputs.grad[i, :3] == 0).all()
+
+
+def test_ratios_are_one_at_first():
+    model = make_model(HPPO, make_vec_env(make_layout_env, 3))
+    model.learn(30)
+    # A new rollout, not yet learnt from
+    model.collect_rollouts(model.env, QuietCallback(model), model.rollout_buffer, model.n_steps)
+    for rollout_data in model.rollout_buffer.get(7):
+        _, log_prob, _ = model.policy.evaluate_actions(rollout_data.observations, rollout_data.actions)
+        assert log_prob.shape == rollout_data.old_log_prob.shape
+        assert rollout_data.advantages.shape == (len(log_prob), 1)
+        np.testing.assert_allclose(th.exp(log_prob - rollout_data.old_log_prob).detach(), 1.0, atol=1e-4)
+
+
+class QuietCallback(BaseCallback):
+    def __init__(self, model):
+        super().__init__()
+        self.init_callback(model)
+
+    def _on_step(self):
+        return True
+
+
+def test_time_limits_bootstrap():
+    """Episodes end by truncation only: with reward 0 all returns come from the value function."""
+
+    class NoReward(LayoutEnv):
+        def step(self, action):
+            obs, _, *rest = super().step(action)
+            return (obs, 0.0, *rest)
+
+    model = make_model(HPPO, NoReward(layouts()["nested"]), gae_lambda=1.0, gamma=1.0)
+    with th.no_grad():
+        for parameter in model.policy.value_net.parameters():
+            parameter.fill_(0.0)
+        model.policy.value_net.bias.fill_(5.0)
+    model._setup_learn(10)
+    model.collect_rollouts(model.env, QuietCallback(model), model.rollout_buffer, model.n_steps)
+    np.testing.assert_allclose(model.rollout_buffer.returns, 5.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_action_masks(n_envs, tmp_path):
+    """The environment raises for masked actions."""
+    env = make_vec_env(MaskedEnv, n_envs)
+    model = make_model(HPPO, env)
+    assert model.use_masking
+    eval_callback = EvalCallback(make_vec_env(make_layout_env, 1), n_eval_episodes=1, eval_freq=5, verbose=0)
+    model.learn(60, callback=eval_callback)
+    evaluate_masked_policy(model, env, 3, deterministic=False)
+    model.save(tmp_path / "model")
+    loaded = HPPO.load(tmp_path / "model", env=env)
+    loaded.learn(30)
+    obs = env.reset()
+    masks = np.tile([False, True, False], (n_envs, 1))
+    assert all(action[0] == 1 for action in loaded.predict(obs, deterministic=True, action_masks=masks)[0])
+    assert loaded.predict(obs[0], action_masks=masks[0])[0][0] == 1
+
+
+def test_masks_that_the_environment_has_not():
+    model = make_model(HPPO, make_layout_env(), use_masking=True)
+    with pytest.raises(ValueError, match="action_masks"):
+        model.learn(10)
+    # Those that it has can be ignored
+    assert not make_model(HPPO, MaskedEnv(), use_masking=False).use_masking
+
+
+def test_batch_size_of_one():
+    with pytest.raises(ValueError, match="batch_size"):
+        make_model(HPPO, make_layout_env(), batch_size=1)
