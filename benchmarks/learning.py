@@ -34,6 +34,8 @@ ALGORITHMS = {
     "pa_td3": sb3_chdp.PATD3,
     "pdqn_td3": sb3_chdp.PDQNTD3,
     "hhqn_td3": sb3_chdp.HHQNTD3,
+    "hyar_td3": sb3_chdp.HyARTD3,
+    "hppo": sb3_chdp.HPPO,
 }
 ROOT = Path(__file__).parent
 FIELDS = ("timesteps", "gradient_steps", "success", "return", "length", "deterministic", "seconds")

@@ -11,23 +11,23 @@ NET_ARCHS = {
 }
 
 
-SCORE_TD3_NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "big": [400, 300]}
+HYBRID_TD3_NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "big": [400, 300]}
 
 
-def convert_score_td3_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+def convert_hybrid_td3_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     :param sampled_params: the raw parameters of a trial
-    :return: arguments of PATD3 or HHQNTD3
+    :return: arguments of PATD3, HHQNTD3, PDQNTD3 or HyARTD3
     """
     hyperparams = sampled_params.copy()
     hyperparams["gamma"] = 1 - hyperparams.pop("one_minus_gamma")
     for name in ("batch_size", "gradient_steps"):
         hyperparams[name] = 2 ** hyperparams.pop(f"{name}_pow")
-    hyperparams["policy_kwargs"] = {"net_arch": SCORE_TD3_NET_ARCHS[hyperparams.pop("net_arch")]}
+    hyperparams["policy_kwargs"] = {"net_arch": HYBRID_TD3_NET_ARCHS[hyperparams.pop("net_arch")]}
     return hyperparams
 
 
-def sample_score_td3_params(
+def sample_hybrid_td3_params(
     trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
 ) -> dict[str, Any]:
     """
@@ -50,9 +50,40 @@ def sample_score_td3_params(
         "exploration_noise": trial.suggest_float("exploration_noise", 0.05, 0.5),
         "exploration_fraction": trial.suggest_float("exploration_fraction", 0.05, 0.5),
         "inverting_gradients": trial.suggest_categorical("inverting_gradients", [False, True]),
-        "net_arch": trial.suggest_categorical("net_arch", list(SCORE_TD3_NET_ARCHS)),
+        "net_arch": trial.suggest_categorical("net_arch", list(HYBRID_TD3_NET_ARCHS)),
     }
-    return convert_score_td3_params(sampled_params)
+    return convert_hybrid_td3_params(sampled_params)
+
+
+def sample_pdqn_td3_params(
+    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """
+    Sampler for the hyperparams of PDQN-TD3, see :func:`sample_hybrid_td3_params`.
+
+    :return: arguments of PDQNTD3
+    """
+    own = {
+        "actor_learning_rate": trial.suggest_float("actor_learning_rate", 1e-5, 1e-3, log=True),
+        "multi_pass": trial.suggest_categorical("multi_pass", [False, True]),
+    }
+    return {**sample_hybrid_td3_params(trial, n_actions, n_envs, additional_args), **own}
+
+
+def sample_hyar_td3_params(
+    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """
+    Sampler for the hyperparams of HyAR-TD3, see :func:`sample_hybrid_td3_params`.
+
+    :return: arguments of HyARTD3
+    """
+    own = {
+        "embedding_dim": trial.suggest_int("embedding_dim", 2, 16),
+        "parameter_latent_dim": trial.suggest_int("parameter_latent_dim", 2, 16),
+        "representation_learning_rate": trial.suggest_float("representation_learning_rate", 1e-5, 1e-3, log=True),
+    }
+    return {**sample_hybrid_td3_params(trial, n_actions, n_envs, additional_args), **own}
 
 
 def convert_chdp_params(sampled_params: dict[str, Any]) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def test_log_prob_against_a_slow_loop(layout):
 
 
 def test_parameters_of_other_actions_get_no_gradient():
-    space, distribution, outputs, log_std = distribution_of("nested")
+    _, distribution, outputs, _ = distribution_of("nested")
     rows = distribution.sample().detach()
     distribution.log_prob(rows)[:, 1].sum().backward()
     owners = np.array([0, 0, 1])  # the third action has no parameters

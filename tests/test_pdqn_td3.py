@@ -29,7 +29,7 @@ def test_multi_pass_against_one_pass_per_action(layout):
 
 @pytest.mark.parametrize("multi_pass", [False, True])
 def test_values_of_chosen_actions(multi_pass):
-    model, spec, features, parameters = networks(multi_pass=multi_pass)
+    model, _, features, parameters = networks(multi_pass=multi_pass)
     k = th.tensor([0, 2, 1, 1, 0])
     for chosen, of_all in zip(
         model.critic.of_actions(features, parameters, k), model.critic(features, parameters), strict=True

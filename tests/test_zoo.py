@@ -83,10 +83,19 @@ def test_optimize_and_train_the_best_trial(trained):
     run("train", "--env", ENV_ID, "-n", "60", "--eval-freq", "-1", "--trial-id", "1", *study, cwd=trained)
 
 
-@pytest.mark.parametrize("algo", ["pa_td3", "hhqn_td3"])
+OFF_POLICY = ["learning_starts:20", "buffer_size:100"]
+BASELINES = {
+    "hppo": ["n_steps:5", "batch_size:10"],
+    "pa_td3": OFF_POLICY,
+    "pdqn_td3": OFF_POLICY,
+    "hhqn_td3": OFF_POLICY,
+    "hyar_td3": [*OFF_POLICY, "representation_warmup_steps:5"],
+}
+
+
+@pytest.mark.parametrize("algo", BASELINES)
 def test_baselines(algo, tmp_path):
-    tiny = ["-n", "60", "-params", "learning_starts:20", "buffer_size:100", "--eval-freq", "-1"]
-    run("train", "--algo", algo, "--env", ENV_ID, *tiny, cwd=tmp_path)
+    run("train", "--algo", algo, "--env", ENV_ID, "-n", "60", "-params", *BASELINES[algo], "--eval-freq", "-1", cwd=tmp_path)
     run("enjoy", "--algo", algo, "--env", ENV_ID, "-f", "logs", "--no-render", "-n", "40", cwd=tmp_path)
     run("optimize", "--algo", algo, "--env", ENV_ID, "-n", "40", "--n-trials", "1", "--n-evaluations", "1",
         "--eval-episodes", "1", "--no-optim-plots", "-f", "tuned", cwd=tmp_path)  # fmt: skip
