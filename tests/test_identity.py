@@ -60,3 +60,15 @@ def test_broken_chdp_fails(broken):
                     weight.register_hook(lambda gradient, mask=mask: gradient * mask)
     model.learn(5000)
     assert success(model) < THRESHOLD - 0.2
+
+
+@pytest.mark.slow
+def test_broken_baselines_fail(off_policy_algorithm):
+    """A critic that does not learn leads nowhere."""
+    if off_policy_algorithm is CHDP:
+        pytest.skip("see test_broken_chdp_fails")
+    env = make_vec_env(HybridIdentityEnv, 8, seed=0)
+    model = off_policy_algorithm("MlpPolicy", env, seed=0, gamma=0.0, **SETTINGS[off_policy_algorithm])
+    model.critic.optimizer.step = lambda *args, **kwargs: None
+    model.learn(2000)
+    assert success(model) < THRESHOLD - 0.2

@@ -59,20 +59,6 @@ def test_inverting_gradients_is_an_option(algorithm, tmp_path):
     assert algorithm.load(tmp_path / "model").policy.inverting_gradients
 
 
-def test_networks_of_hhqn():
-    model = HHQNTD3("MlpPolicy", make_layout_env(), **SMALL)
-    model.learn(40)
-    q1, q2 = (set(map(id, net.parameters())) for net in model.critic.q_networks)
-    assert not q1 & q2
-    obs = th.rand(8, 2)
-    values = model.critic(obs, model.actor(obs))
-    assert (values[0] != values[1]).all()
-    before = {name: p.clone() for name, p in model.policy.named_parameters() if "target" in name}
-    model.train(2, 32)
-    moved = {name for name, p in model.policy.named_parameters() if name in before and (p != before[name]).any()}
-    assert moved == set(before), "every target moves, the lower actor's too"
-
-
 def test_lower_actor_sees_the_noisy_scores():
     model = HHQNTD3("MlpPolicy", make_layout_env(), **SMALL)
     obs = np.zeros((1, 2), dtype=np.float32)

@@ -117,7 +117,7 @@ class CHDPPolicy(HybridPolicy):
     :param features_extractor_kwargs: its keyword arguments
     :param normalize_images: whether to divide images by 255
     :param optimizer_class: optimizer of all networks
-    :param optimizer_kwargs: its keyword arguments, without the learning rate
+    :param optimizer_kwargs: its keyword arguments, without the learning rate; ``fused=True`` for Adam if None
     :param share_features_extractor: whether both agents use the critic's features extractor, which then learns from the
         critic's loss alone; otherwise they have their own, which learns from the loss of the discrete policy
     :param diffusion: whether the policies are diffusion models (False: deterministic MLPs)
@@ -154,6 +154,9 @@ class CHDPPolicy(HybridPolicy):
         n_action_candidates: int = 16,
         exploration_noise: float = 0.1,
     ):
+        if optimizer_kwargs is None:
+            # One kernel per step instead of a loop over parameters
+            optimizer_kwargs = {"fused": True} if optimizer_class == th.optim.Adam else {}
         super().__init__(
             observation_space,
             action_space,

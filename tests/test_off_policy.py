@@ -1,0 +1,67 @@
+"""What all off-policy algorithms must get right, whatever their actors look like."""
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_chdp import CHDP
+from tests.algorithms import OFF_POLICY_ALGORITHMS, make_model
+from tests.hybrid_envs import make_layout_env
+
+
+def test_deterministic_predictions_repeat(algorithm):
+    model = make_model(algorithm, make_layout_env()).learn(20)
+    obs = np.random.default_rng(0).uniform(-1, 1, (10, 2)).astype(np.float32)
+    np.testing.assert_equal(model.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+
+
+def test_twin_critics_are_independent(off_policy_algorithm):
+    model = make_model(off_policy_algorithm, make_layout_env())
+    q1, q2 = model.critic.q_networks
+    assert not {id(p) for p in q1.parameters()} & {id(p) for p in q2.parameters()}
+    for p, q in zip(q1.parameters(), q2.parameters(), strict=True):
+        assert (p != q).any()
+    before = [p.clone() for p in model.critic.parameters()]
+    model.learn(20)
+    assert all((p != q).any() for p, q in zip(model.critic.parameters(), before, strict=True))
+
+
+def test_every_target_moves(off_policy_algorithm):
+    model = make_model(off_policy_algorithm, make_layout_env()).learn(20)
+    before = {name: p.clone() for name, p in model.policy.named_parameters() if "target" in name}
+    assert {name.split(".")[0] for name in before} == {"actor_target", "critic_target"}
+    model.train(2, 16)
+    moved = {name for name, p in model.policy.named_parameters() if name in before and (p != before[name]).any()}
+    # Only the codewords that a batch uses learn
+    assert moved | {"actor_target.codebook.codewords"} == set(before) | {"actor_target.codebook.codewords"}
+
+
+def test_the_actor_step_leaves_the_critic_alone(off_policy_algorithm):
+    critics = []
+    for policy_delay in (1, 10**9):
+        model = make_model(off_policy_algorithm, make_layout_env(), policy_delay=policy_delay, gradient_steps=0).learn(20)
+        th.manual_seed(1)
+        np.random.seed(1)
+        model.train(1, 16)
+        critics.append([p.detach() for p in model.critic.parameters()])
+    assert all(th.equal(p, q) for p, q in zip(*critics, strict=True))
+
+
+def test_time_limits_bootstrap(off_policy_algorithm):
+    """Every episode of the environment ends by truncation."""
+    model = make_model(off_policy_algorithm, make_layout_env()).learn(45)
+    assert model.replay_buffer.dones.sum() == 4
+    assert not model.replay_buffer.sample(200).dones.any()
+
+
+@pytest.mark.parametrize("final, initial, expected", [(0.2, None, (0.2, 0.2, 0.2)), (0.1, 0.9, (0.9, 0.5, 0.1))])
+@pytest.mark.parametrize("name", [algorithm.__name__ for algorithm in OFF_POLICY_ALGORITHMS if algorithm is not CHDP])
+def test_exploration_noise_schedule(name, final, initial, expected):
+    algorithm = next(algorithm for algorithm in OFF_POLICY_ALGORITHMS if algorithm.__name__ == name)
+    model = make_model(
+        algorithm, make_layout_env(), exploration_noise=final, exploration_initial_noise=initial, exploration_fraction=0.5
+    )
+    for progress, std in zip((1.0, 0.75, 0.2), expected, strict=True):
+        assert model.exploration_noise_schedule(progress) == pytest.approx(std)
+        model._current_progress_remaining = progress
+        assert model._draw_noise(5000).std() == pytest.approx(std, rel=0.1)
