@@ -1,29 +1,40 @@
 """
-Speed of the environments, of acting and of a gradient step; medians over repeats, one process, one thread.
+Speed, as medians over repeats in one process on one thread; the results replace the section of benchmarks/README.md.
 
-    make speed
+    make speed                                        all tables
+    python benchmarks/speed.py --tables step loop     some of them, printed only
 
-The environments are compared with the figures of the original packages, which were measured on another machine (AMD EPYC,
-2 vCPUs, Python 3.11.7): read those ratios as orders of magnitude.
+Ratios compare what ran side by side, turn by turn. Only the original environments were measured elsewhere (AMD EPYC, 2
+vCPUs, Python 3.11.7): read those ratios as orders of magnitude.
 """
 
 import argparse
 import platform
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import stable_baselines3 as sb3
 import torch as th
+from cells import ALGORITHMS
+from dql_style import DQLStyleCHDP
 from gymnasium import spaces
 from stable_baselines3 import TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
+from torch import nn
+from torch.profiler import ProfilerActivity, profile
 
 import sb3_chdp
 from sb3_chdp import CHDP, FlattenHybridAction, HybridActionSpec
 
+README = Path(__file__).with_name("README.md")
+START, END = "<!-- speed: start -->", "<!-- speed: end -->"
+ENV_ID = "HardMove6-v0"
 # Of the originals with a uniformly random policy: frames per second for Platform (with numba) and Goal, else steps
 REFERENCE_RATES = {
     "Platform-v0": 21_000,
@@ -35,51 +46,73 @@ REFERENCE_RATES = {
     "HardMove8-v0": 1_350,
     "HardMove10-v0": 350,
 }
+BIG = dict(net_arch=dict(pi=[256, 256], qf=[256, 256]))
 
 
-def median_seconds(function: Callable[[], object], repeats: int) -> float:
-    """:return: median duration of a call, after one call to warm up"""
-    function()
-    durations = []
-    for _ in range(repeats):
-        start = time.perf_counter()
+class ManyActions(gym.Env):
+    """K discrete actions with a shared parameter; nothing happens."""
+
+    def __init__(self, n_actions: int):
+        self.observation_space = spaces.Box(-1.0, 1.0, (4,), dtype=np.float32)
+        self.action_space = spaces.Tuple((spaces.Discrete(n_actions), spaces.Box(-1.0, 1.0, (1,))))
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        return self.np_random.uniform(-1, 1, 4).astype(np.float32), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
+        return self.reset()[0], 0.0, False, False, {}
+
+
+def medians(functions: list[Callable[[], object]], repeats: int) -> list[float]:
+    """:return: median seconds of each function, called in turns, after one call to warm up"""
+    durations: list[list[float]] = [[] for _ in functions]
+    for function in functions:
         function()
-        durations.append(time.perf_counter() - start)
-    return statistics.median(durations)
+    for _ in range(repeats):
+        for function, values in zip(functions, durations, strict=True):
+            start = time.perf_counter()
+            function()
+            values.append(time.perf_counter() - start)
+    return [statistics.median(values) for values in durations]
 
 
-def env_rates(env_id: str, seconds: float) -> tuple[float, float]:
-    """:return: steps and frames per second under a uniformly random policy, sampling and resets included"""
-    env = gym.make(env_id)
-    spec = HybridActionSpec(env.action_space)
-    rng = np.random.default_rng(0)
-    env.reset(seed=0)
-    rates = []
-    for _ in range(3):
-        steps = frames = 0
-        start = time.perf_counter()
-        while time.perf_counter() - start < seconds / 3:
-            for action in spec.to_native_batch(spec.sample_rows(rng, 32)):
-                _, _, terminated, truncated, info = env.step(action)
-                steps += 1
-                frames += info["frames"]
-                if terminated or truncated:
-                    env.reset()
-        duration = time.perf_counter() - start
-        rates.append((steps / duration, frames / duration))
-    return statistics.median(r[0] for r in rates), statistics.median(r[1] for r in rates)
+def build(algorithm: type[BaseAlgorithm], env: Any = ENV_ID, n_envs: int = 8, wrapper: Any = None, **kwargs: Any) -> Any:
+    """:return: a model with some data in its replay buffer and no training yet"""
+    vec_env = make_vec_env(env, n_envs, seed=0, wrapper_class=wrapper)
+    settings = dict(seed=0, device="cpu", learning_starts=300, buffer_size=10_000, gradient_steps=0, batch_size=128)
+    return algorithm("MlpPolicy", vec_env, **{**settings, **kwargs}).learn(600)
 
 
-def print_env_table(seconds: float) -> None:
-    print("\n| environment | steps/s | frames/s | original (other machine) | ratio |\n|---|---|---|---|---|")
+def environments(repeats: int) -> Iterator[str]:
+    """(e) steps per second under a uniformly random policy, sampling and resets included"""
+    yield "| environment | steps/s | frames/s | original (other machine) | ratio |\n|---|---|---|---|---|"
     for env_id, reference in REFERENCE_RATES.items():
-        steps, frames = env_rates(env_id, seconds)
-        ratio = (frames if reference and env_id in ("Platform-v0", "Goal-v0", "HardGoal-v0") else steps) / reference
-        print(f"| {env_id} | {steps:,.0f} | {frames:,.0f} | {reference:,} | {ratio:.0f} |")
+        env = gym.make(env_id)
+        spec = HybridActionSpec(env.action_space)
+        rng = np.random.default_rng(0)
+        env.reset(seed=0)
+        rates = []
+        for _ in range(3):
+            steps = frames = 0
+            start = time.perf_counter()
+            while time.perf_counter() - start < repeats / 30:
+                for action in spec.to_native_batch(spec.sample_rows(rng, 32)):
+                    _, _, terminated, truncated, info = env.step(action)
+                    steps += 1
+                    frames += info["frames"]
+                    if terminated or truncated:
+                        env.reset()
+            duration = time.perf_counter() - start
+            rates.append((steps / duration, frames / duration))
+        step_rate, frame_rate = (statistics.median(values) for values in zip(*rates, strict=True))
+        ratio = (frame_rate if env_id in ("Platform-v0", "Goal-v0", "HardGoal-v0") else step_rate) / reference
+        yield f"| {env_id} | {step_rate:,.0f} | {frame_rate:,.0f} | {reference:,} | {ratio:.0f} |"
 
 
-def print_conversion_table(repeats: int) -> None:
-    print("\n| action space | microseconds per native action (batch of 8) |\n|---|---|")
+def conversion(repeats: int) -> Iterator[str]:
+    """Rows to native actions"""
+    yield "| action space | microseconds per native action (batch of 8) |\n|---|---|"
     box = spaces.Box(-1.0, 1.0, (1,))
     cases = {
         "nested, K = 4": spaces.Tuple((spaces.Discrete(4), spaces.Tuple([box] * 4))),
@@ -90,41 +123,177 @@ def print_conversion_table(repeats: int) -> None:
     for name, space in cases.items():
         spec = HybridActionSpec(space)
         rows = spec.sample_rows(np.random.default_rng(0), 8)
-        print(f"| {name} | {median_seconds(lambda s=spec, r=rows: s.to_native_batch(r), 20 * repeats) / 8 * 1e6:.0f} |")
+        (seconds,) = medians([lambda s=spec, r=rows: s.to_native_batch(r)], 20 * repeats)
+        yield f"| {name} | {seconds / 8 * 1e6:.0f} |"
 
 
-def print_chdp_table(repeats: int) -> None:
-    print("\n| HardMove6-v0 | milliseconds | ratio to SB3's TD3 |\n|---|---|---|")
-    rows: list[tuple[str, float, float]] = []
-    env = make_vec_env("HardMove6-v0", 8, seed=0)
-    model = CHDP("MlpPolicy", env, seed=0, device="cpu", learning_starts=300, buffer_size=10_000, gradient_steps=0)
-    flat_env = make_vec_env("HardMove6-v0", 8, seed=0, wrapper_class=FlattenHybridAction)
-    td3 = TD3("MlpPolicy", flat_env, seed=0, device="cpu", learning_starts=300, buffer_size=10_000, gradient_steps=0,
-              policy_kwargs=dict(net_arch=dict(pi=[128, 128], qf=[256, 256])))  # fmt: skip
-    for algorithm in (model, td3):
-        algorithm.learn(400)
-    td3_step = median_seconds(lambda: td3.train(2, 128), repeats) / 2
-    step = median_seconds(lambda: model.train(1, 128), repeats)
-    rows.append(("gradient step, batch 128", step, td3_step))
-    for n in (1, 64):
+def step(repeats: int) -> Iterator[str]:
+    """(a) gradient step of CHDP against chains in the style of the Diffusion Q-learning code, 15 denoising steps"""
+    cases: list[tuple[str, type[CHDP], int, dict[str, Any]]] = [
+        ("CHDP, defaults (2 x 128, SiLU)", CHDP, 128, {}),
+        ("DQL style, its defaults (3 x 256, Mish)", DQLStyleCHDP, 256,
+         dict(net_arch=dict(pi=[256] * 3, qf=[256] * 3), activation_fn=nn.Mish, optimizer_kwargs={})),
+        ("CHDP, 2 x 256, SiLU", CHDP, 256, BIG),
+        ("DQL style, 2 x 256, SiLU", DQLStyleCHDP, 256, dict(BIG, activation_fn=nn.SiLU, optimizer_kwargs={})),
+        ("DQL style, 2 x 256, Mish", DQLStyleCHDP, 256, dict(BIG, activation_fn=nn.Mish, optimizer_kwargs={})),
+    ]  # fmt: skip
+    models = [build(algorithm, policy_kwargs=kwargs or None) for _, algorithm, _, kwargs in cases]
+    seconds = medians([lambda m=m, b=c[2]: m.train(1, b) for m, c in zip(models, cases, strict=True)], repeats)
+    yield "| gradient step | batch | milliseconds | DQL style takes |\n|---|---|---|---|"
+    for (name, algorithm, batch_size, _), value in zip(cases, seconds, strict=True):
+        ours = seconds[0] if "its defaults" in name else seconds[2]
+        ratio = f"{value / ours:.1f} x" if algorithm is DQLStyleCHDP else ""
+        yield f"| {name} | {batch_size} | {1e3 * value:.1f} | {ratio} |"
+
+
+def matrix_products(repeats: int) -> Iterator[str]:
+    """(b) distance to the matrix products of a step, which are run once more on their own"""
+    yield "| configuration | step, ms | its matrix products alone, ms | ratio |\n|---|---|---|---|"
+    for name, batch_size, kwargs in (("defaults", 128, None), ("2 x 256", 256, BIG)):
+        model = build(CHDP, policy_kwargs=kwargs)
+        model.train(2, batch_size)
+        with profile(activities=[ProfilerActivity.CPU], record_shapes=True) as record:
+            model.train(1, batch_size)
+        shapes = [
+            [tuple(shape) for shape in event.input_shapes if len(shape) == 2][-2:]
+            for event in record.events()
+            if event.name in ("aten::addmm", "aten::mm", "aten::addmm_")
+        ]
+        pairs = {(a, b): (th.randn(a), th.randn(b)) for a, b in shapes}
+        products = [pairs[a, b] for a, b in shapes]
+
+        def only_products(products: Any = products) -> None:
+            for a, b in products:
+                th.mm(a, b)
+
+        whole, floor = medians([lambda m=model, b=batch_size: m.train(1, b), only_products], repeats)
+        label = f"{name}, batch {batch_size}: {len(products)} products"
+        yield f"| {label} | {1e3 * whole:.1f} | {1e3 * floor:.1f} | {whole / floor:.1f} |"
+
+
+def predict(repeats: int) -> Iterator[str]:
+    """(c) acting, deterministic, CHDP with the best of 16 candidates"""
+    yield "| observations | CHDP, ms | CHDP, N = 5, ms | SB3's TD3, ms |\n|---|---|---|---|"
+    models = [build(CHDP), build(CHDP, n_diffusion_steps=5), build(TD3, wrapper=FlattenHybridAction)]
+    for n in (1, 8, 64):
         obs = np.random.default_rng(0).uniform(-1, 1, (n, 4)).astype(np.float32)
-        ours, theirs = (median_seconds(lambda a=a, o=obs: a.predict(o, deterministic=True), repeats) for a in (model, td3))
-        rows.append((f"predict, {n} observation(s), best of 16", ours, theirs))
-    for name, ours, theirs in rows:
-        print(f"| {name} | {1e3 * ours:.1f} | {ours / theirs:.1f} |")
-    print(f"\n{1 / step:.0f} gradient steps per second")
+        seconds = medians([lambda m=m, o=obs: m.predict(o, deterministic=True) for m in models], repeats)
+        yield f"| {n} | " + " | ".join(f"{1e3 * value:.2f}" for value in seconds) + " |"
 
 
-if __name__ == "__main__":
+def discrete_actions(repeats: int) -> Iterator[str]:
+    """(d) number of discrete actions, CHDP's defaults"""
+    yield "| K | gradient step, ms | ratio to K = 4 |\n|---|---|---|"
+    sizes = (4, 64, 1024, 65_536)
+    models = [build(CHDP, lambda k=k: ManyActions(k)) for k in sizes]
+    seconds = medians([lambda m=m: m.train(1, 128) for m in models], repeats)
+    for k, value in zip(sizes, seconds, strict=True):
+        yield f"| {k:,} | {1e3 * value:.1f} | {value / seconds[0]:.2f} |"
+
+
+def baselines(repeats: int) -> Iterator[str]:
+    """(g) gradient step of every algorithm; networks of 2 x 256, batch 128 (CHDP: its defaults)"""
+    rows: list[tuple[str, Callable[[], object], int]] = []
+    settings = dict(policy_kwargs=dict(net_arch=[256, 256]))
+    rows.append(("SB3's TD3", build(TD3, wrapper=FlattenHybridAction, **settings), 2))
+    for name in ("pa_td3", "pdqn_td3", "hhqn_td3", "hyar_td3"):
+        rows.append((ALGORITHMS[name].__name__, build(ALGORITHMS[name], **settings), 2))
+    rows.append(("PDQNTD3, multi_pass", build(ALGORITHMS["pdqn_td3"], multi_pass=True, **settings), 2))
+    rows.append(("CHDP", build(CHDP), 1))
+    rows.append(("CHDP, N = 5", build(CHDP, n_diffusion_steps=5), 1))
+    seconds = medians([lambda m=model, n=n: m.train(n, 128) for _, model, n in rows], repeats)  # type: ignore[attr-defined]
+    per_step = [value / n for value, (_, _, n) in zip(seconds, rows, strict=True)]
+    env = make_vec_env(ENV_ID, 8, seed=0)
+    hppo = ALGORITHMS["hppo"](
+        "MlpPolicy", env, n_steps=128, n_epochs=1, seed=0, device="cpu", policy_kwargs=settings["policy_kwargs"]
+    )
+    hppo.learn(1024)
+    (rollout,) = medians([hppo.train], repeats // 3)  # 16 minibatches
+    per_step.append(rollout / 16)
+    yield "| algorithm | gradient step, ms | ratio to TD3 |\n|---|---|---|"
+    for name, value in zip([*(row[0] for row in rows), "HPPO, minibatch 64"], per_step, strict=True):
+        yield f"| {name} | {1e3 * value:.2f} | {value / per_step[0]:.2f} |"
+
+
+def loop(repeats: int) -> Iterator[str]:
+    """(f) the whole training loop of CHDP with the settings of its YAML file, and where its time goes"""
+    yield "| environments | steps/s | gradient steps per step | acting | environment | buffer | update | rest |"
+    yield "|---|---|---|---|---|---|---|---|"
+    for n_envs in (1, 8):
+        shares = dict.fromkeys(("acting", "environment", "buffer", "update"), 0.0)
+        # One gradient step for two environment steps, as the YAML file has it
+        settings = dict(n_diffusion_steps=5, train_freq=max(2 // n_envs, 1), exploration_initial_eps=0.05)
+        model = build(CHDP, n_envs=n_envs, **settings)
+        model.gradient_steps = max(n_envs // 2, 1)
+
+        def timed(owner: Any, method: str, name: str, shares: dict[str, float] = shares) -> None:
+            function = getattr(owner, method)
+
+            def wrapper(*args: Any, **kwargs: Any) -> Any:
+                start = time.perf_counter()
+                result = function(*args, **kwargs)
+                shares[name] += time.perf_counter() - start
+                return result
+
+            setattr(owner, method, wrapper)
+
+        timed(model, "_sample_action", "acting")
+        timed(model.env, "step", "environment")
+        timed(model, "_store_transition", "buffer")
+        timed(model, "train", "update")
+        n_steps = 40 * repeats
+        start = time.perf_counter()
+        model.learn(n_steps, reset_num_timesteps=False)
+        total = time.perf_counter() - start
+        shares["rest"] = total - sum(shares.values())
+        values = " | ".join(f"{100 * value / total:.0f} %" for value in shares.values())
+        yield f"| {n_envs} | {n_steps / total:.0f} | 0.5 | {values} |"
+
+
+def memory(repeats: int) -> Iterator[str]:
+    """(h) replay buffers of 1e6 transitions: bytes of their arrays, which are allocated at once"""
+    yield "| environment | algorithm | row | replay buffer, MB |\n|---|---|---|---|"
+    for env_id in ("Platform-v0", "HardMove10-v0"):
+        for name, algorithm in ALGORITHMS.items():
+            if name == "hppo":
+                continue
+            model = algorithm("MlpPolicy", env_id, buffer_size=10, device="cpu")
+            buffer = model.replay_buffer
+            arrays = [value for value in vars(buffer).values() if isinstance(value, np.ndarray)]
+            size = sum(array.nbytes for array in arrays) / buffer.buffer_size
+            yield f"| {env_id} | {algorithm.__name__} | {buffer.actions.shape[-1]} | {size:,.0f} |"
+
+
+TABLES = {
+    function.__name__: function
+    for function in (step, matrix_products, predict, discrete_actions, environments, conversion, loop, baselines, memory)
+}
+
+
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=6.0, help="seconds per environment")
+    parser.add_argument("--tables", nargs="+", choices=list(TABLES), help="print only these")
     parser.add_argument("--repeats", type=int, default=30)
     args = parser.parse_args()
     th.set_num_threads(1)
-    print(
+    cpu = [line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line]
+    text = (
         f"sb3_chdp {sb3_chdp.__version__}, stable_baselines3 {sb3.__version__}, torch {th.__version__}, "
-        f"Python {platform.python_version()}, {platform.processor() or platform.machine()}, 1 thread"
+        f"Python {platform.python_version()}, {cpu[0]} ({len(cpu)} virtual cores), 1 thread\n"
     )
-    print_env_table(args.seconds)
-    print_conversion_table(args.repeats)
-    print_chdp_table(args.repeats)
+    print(text)
+    for name in args.tables or TABLES:
+        title = f"\n### {(TABLES[name].__doc__ or '').strip()}\n"
+        print(title)
+        lines = []
+        for line in TABLES[name](args.repeats):
+            print(line, flush=True)
+            lines.append(line)
+        text += "\n".join([title, *lines, ""])
+    if not args.tables:
+        before, rest = README.read_text().split(START)
+        README.write_text(f"{before}{START}\n{text}{END}{rest.split(END)[1]}")
+
+
+if __name__ == "__main__":
+    main()

@@ -7,11 +7,14 @@ The command ``sb3-chdp``: rl_zoo3's scripts with the algorithms and environments
     sb3-chdp record --env Platform-v0 -f logs    record a video of it
     sb3-chdp plot --env Platform-v0 -f logs -y success     learning curves
     sb3-chdp all_plots | plot_from_file | record_training   the other scripts of rl_zoo3
+    sb3-chdp benchmark main --jobs 2             reproduce the paper's tables (in a clone of the repository)
 """
 
 import importlib.util
 import runpy
+import subprocess
 import sys
+from pathlib import Path
 
 SCRIPTS = {
     "train": "rl_zoo3.train",
@@ -27,6 +30,7 @@ SCRIPTS = {
 WITH_ALGO = ("train", "optimize", "enjoy", "record", "record_training", "plot")
 # What rl_zoo3 2.9.2 imports, declared by it or not
 REQUIRED = ("rl_zoo3", "requests", "pandas", "tensorboard")
+BENCHMARK = Path(__file__).parent.parent / "benchmarks" / "reproduce.py"
 
 
 def _option(arguments: list[str], *names: str) -> str | None:
@@ -60,14 +64,25 @@ def prepare_arguments(command: str, arguments: list[str]) -> list[str]:
     return arguments
 
 
+def run_benchmark(arguments: list[str]) -> None:
+    """Run ``benchmarks/reproduce.py``, which is not part of the package."""
+    if not BENCHMARK.is_file():
+        sys.exit("sb3-chdp benchmark works in a clone of the repository: it writes to its folder benchmarks")
+    # As a script, so that its worker processes find it
+    sys.exit(subprocess.run([sys.executable, str(BENCHMARK), *arguments]).returncode)
+
+
 def main() -> None:
     """Entry point of ``sb3-chdp`` and ``python -m sb3_chdp``."""
     if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
         print(__doc__)
         return
     command, arguments = sys.argv[1], sys.argv[2:]
-    if command not in SCRIPTS:
-        sys.exit(f"sb3-chdp: unknown command {command!r}, choose from {', '.join(SCRIPTS)}")
+    if command not in (*SCRIPTS, "benchmark"):
+        sys.exit(f"sb3-chdp: unknown command {command!r}, choose from {', '.join(SCRIPTS)}, benchmark")
+    if command == "benchmark":
+        run_benchmark(arguments)
+        return
     missing = [name for name in REQUIRED if importlib.util.find_spec(name) is None]
     if missing:
         sys.exit(f"sb3-chdp {command} needs {', '.join(missing)}: pip install 'sb3-chdp[zoo]'")
