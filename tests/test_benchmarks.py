@@ -5,11 +5,16 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch as th
+from torch import nn
+
+from sb3_chdp.chdp.diffusion import DiffusionModel
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
 import cells  # noqa: E402
+import dql_style  # noqa: E402
 import tables  # noqa: E402
 
 TINY = {
@@ -79,3 +84,23 @@ def test_tables(tmp_path):
 
 def test_the_papers_figures_are_complete():
     assert all(len(tables.PAPER[table]) == n for table, n in (("main", 48), ("ablation", 10)))
+
+
+def test_chains_in_the_style_of_diffusion_q_learning_are_ours():
+    """What the speed is measured against computes the same numbers, gradients included."""
+    ours = DiffusionModel(3, 4, 5, [16, 16], nn.Mish)
+    theirs = dql_style.DQLDiffusion(3, 4, 5, [16, 16], nn.Mish)
+    predictor = ours.noise_predictor
+    for mine, other in ((0, 1), (2, 3)):
+        theirs.time_mlp[other].load_state_dict(predictor.time_mlp[mine].state_dict())
+    first = th.cat([predictor.x_weight, predictor.time_weight, predictor.condition_weight], dim=1)
+    theirs.mid_layer[0].load_state_dict({"weight": first.detach(), "bias": predictor.bias.detach()})
+    theirs.mid_layer[2].load_state_dict(predictor.trunk[1].state_dict())
+    theirs.final_layer.load_state_dict(predictor.trunk[3].state_dict())
+    noise, gradients = ours.draw_noise(6), []
+    condition = th.randn(6, 4, requires_grad=True)
+    samples = [model.sample(condition, noise) for model in (ours, theirs)]
+    th.testing.assert_close(*samples, atol=1e-5, rtol=0)
+    for sample in samples:
+        gradients.append(th.autograd.grad(sample.square().sum(), condition)[0])
+    th.testing.assert_close(*gradients, atol=1e-4, rtol=1e-3)

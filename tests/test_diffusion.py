@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 import torch as th
+from torch import nn
 
 from sb3_chdp.chdp.diffusion import DeterministicModel, DiffusionModel, NoiseSchedule, cosine_beta_schedule
 
@@ -91,7 +92,8 @@ def test_chain_with_a_linear_denoiser_gives_the_analytic_gaussian(variance_type)
         a = (1 - (1 - alpha) / (1 - abar) * gain) / alpha**0.5
         b = (1 - alpha) / (1 - abar) * gain * abar**0.5 * mean / alpha**0.5
         m, v = a * m + b, a * a * v + (schedule.sigmas[i] ** 2 if i > 0 else 0.0)
-    x = model.sample(th.zeros(40_000, 1))
+    with th.no_grad():
+        x = model.sample(th.zeros(40_000, 1))
     assert x.mean().item() == pytest.approx(m, abs=4e-3)
     assert x.std().item() == pytest.approx(v**0.5, rel=0.03)
     assert m == pytest.approx(mean, abs=0.02)
@@ -136,6 +138,30 @@ def test_split_first_layer_equals_the_layer_on_the_concatenation():
     hidden = th.cat([x, embedding, condition], dim=1) @ weight.t() + predictor.bias
     actual = predictor(x, predictor.condition_context(condition) + predictor.time_context()[i])
     th.testing.assert_close(actual, predictor.trunk(hidden))
+
+
+@pytest.mark.parametrize("net_arch", [[16], [16, 8], [8, 16, 8]], ids=str)
+@pytest.mark.parametrize("activation_fn", [nn.SiLU, nn.ReLU, nn.Tanh, nn.Mish])
+@pytest.mark.parametrize("masked", [False, True])
+def test_written_out_gradients_equal_autograd(net_arch, activation_fn, masked):
+    model = DiffusionModel(3, 2, 6, net_arch, activation_fn)
+    predictor, schedule = model.noise_predictor, model.schedule
+    condition, noise = th.randn(20, 2, requires_grad=True), model.draw_noise(20)
+    mask = (th.rand(20, 3) < 0.6).float() if masked else None
+    context, times = predictor.condition_context(condition), predictor.time_context()
+    x = noise[0]
+    for i in reversed(range(6)):
+        x = x if mask is None else x * mask
+        x = model.p_mean(x, i, predictor(x, context + times[i]))
+        x = x + schedule.sigmas[i] * noise[i] if i > 0 else x
+    plain = x.clamp(-1, 1) if mask is None else x.clamp(-1, 1) * mask
+    fast = model.sample(condition, noise, mask)
+    th.testing.assert_close(fast, plain, atol=1e-5, rtol=0)
+    with th.no_grad():
+        th.testing.assert_close(model.sample(condition, noise, mask), plain, atol=1e-5, rtol=0)
+    inputs, weights = [condition, *model.parameters()], th.randn(20, 3)
+    for mine, theirs in zip(*(th.autograd.grad((s * weights).sum(), inputs) for s in (fast, plain)), strict=True):
+        th.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-3)
 
 
 def test_padding_never_matters():

@@ -9,6 +9,8 @@ from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_chdp.chdp.denoising import DenoisingChain, StepConstants
+
 
 def vp_beta_schedule(n_steps: int, beta_min: float = 0.1, beta_max: float = 10.0) -> np.ndarray:
     """
@@ -77,6 +79,17 @@ class NoiseSchedule:
         self.posterior_mean_coef2: list[float] = ((1 - alphas_cumprod_prev) * np.sqrt(alphas) / (1 - alphas_cumprod)).tolist()
         variance = betas if variance_type == "fixed_large" else posterior_variance
         self.sigmas: list[float] = np.sqrt(variance).tolist()
+        self.steps = [
+            StepConstants(*constants)
+            for constants in zip(
+                self.sqrt_recip_alphas_cumprod,
+                self.sqrt_recipm1_alphas_cumprod,
+                self.posterior_mean_coef1,
+                self.posterior_mean_coef2,
+                self.sigmas,
+                strict=True,
+            )
+        ]
 
 
 class NoisePredictor(nn.Module):
@@ -210,15 +223,21 @@ class DiffusionModel(nn.Module):
         """
         if noise is None:
             noise = self.draw_noise(len(condition))
-        x, *injected = noise.unbind()
-        context = self.noise_predictor.condition_context(condition)
-        times = self.noise_predictor.time_context().unbind()
-        for i in reversed(range(self.schedule.n_steps)):
-            if mask is not None:
-                x = x * mask
-            x = self.p_mean(x, i, self.noise_predictor(x, context + times[i]))
-            if i > 0:
-                x = th.add(x, injected[i - 1], alpha=self.schedule.sigmas[i])
+        predictor = self.noise_predictor
+        context, times = predictor.condition_context(condition), predictor.time_context()
+        if th.is_grad_enabled():
+            activation, *layers = predictor.trunk
+            parameters = [p for layer in layers for p in layer.parameters()]
+            steps = self.schedule.steps
+            x = DenoisingChain.apply(steps, activation, noise, mask, context, times, predictor.x_weight, *parameters)
+        else:
+            x = noise[0]
+            for i in reversed(range(self.schedule.n_steps)):
+                if mask is not None:
+                    x = x * mask
+                x = self.p_mean(x, i, predictor(x, context + times[i]))
+                if i > 0:
+                    x.add_(noise[i], alpha=self.schedule.sigmas[i])
         x = x.clamp(-1, 1)
         return x if mask is None else x * mask
 

@@ -7,6 +7,10 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
+from torch.nn import functional as F
+
+# Rows of a table that are searched at a time, and size of the groups that are told apart first; one divides the other
+NEAREST_ROW_CHUNK, NEAREST_ROW_GROUP = 2048, 128
 
 
 def polyak_update(params: Iterable[th.Tensor], target_params: Iterable[th.Tensor], tau: float) -> None:
@@ -28,7 +32,19 @@ def nearest_row(points: th.Tensor, table: th.Tensor) -> th.Tensor:
     :return: (B,) index of the row of the table that is nearest in Euclidean distance
     """
     # |p - t|^2 without |p|^2, which is the same for all rows
-    return th.addmm(table.square().sum(dim=1), points, table.t(), alpha=-2).argmin(dim=1)
+    squares = table.square().sum(dim=1)
+    if len(table) <= NEAREST_ROW_CHUNK:
+        return th.addmm(squares, points, table.t(), alpha=-2).min(dim=1).indices
+    # The distances to all rows of a large table do not fit into the processor's cache, and the place of a minimum takes
+    # longer to find than its value: first the nearest group of rows, chunk by chunk, then the row within the group
+    padding = -len(table) % NEAREST_ROW_GROUP
+    table, squares = F.pad(table, (0, 0, 0, padding)), F.pad(squares, (0, padding), value=th.inf)
+    chunks = zip(table.split(NEAREST_ROW_CHUNK), squares.split(NEAREST_ROW_CHUNK), strict=True)
+    of_groups = [th.addmm(s, points, t.t(), alpha=-2).view(len(points), -1, NEAREST_ROW_GROUP).amin(dim=2) for t, s in chunks]
+    group = th.cat(of_groups, dim=1).argmin(dim=1)
+    rows = table.view(-1, NEAREST_ROW_GROUP, table.shape[1])[group]
+    distances = squares.view(-1, NEAREST_ROW_GROUP)[group] - 2 * th.bmm(rows, points[:, :, None]).squeeze(2)
+    return group * NEAREST_ROW_GROUP + distances.argmin(dim=1)
 
 
 def hash_observations(observations: PyTorchObs) -> th.Tensor:

@@ -1,0 +1,11 @@
+import pytest
+import torch as th
+
+from sb3_chdp.common.utils import nearest_row
+
+
+@pytest.mark.parametrize("n_rows", [1, 5, 2048, 2049, 5000, 65_536])
+def test_nearest_row_against_all_distances(n_rows):
+    points, table = th.rand(50, 3) * 2 - 1, th.rand(n_rows, 3) * 2 - 1
+    assert th.equal(nearest_row(points, table), th.cdist(points.double(), table.double()).argmin(dim=1))
+    assert th.equal(nearest_row(table[-50:], table), th.arange(n_rows)[-50:])
