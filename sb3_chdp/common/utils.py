@@ -31,20 +31,22 @@ def nearest_row(points: th.Tensor, table: th.Tensor) -> th.Tensor:
     :param table: (K, d)
     :return: (B,) index of the row of the table that is nearest in Euclidean distance
     """
-    # |p - t|^2 without |p|^2, which is the same for all rows
-    squares = table.square().sum(dim=1)
-    if len(table) <= NEAREST_ROW_CHUNK:
-        return th.addmm(squares, points, table.t(), alpha=-2).min(dim=1).indices
+    # |p - t|^2 without |p|^2, which is the same for all rows, as one product: (p, 1) (-2 t, |t|^2)
+    points = F.pad(points, (0, 1), value=1.0)
+    rows = th.cat([-2 * table, table.square().sum(dim=1, keepdim=True)], dim=1)
+    if len(rows) <= NEAREST_ROW_CHUNK:
+        return th.mm(points, rows.t()).min(dim=1).indices
     # The distances to all rows of a large table do not fit into the processor's cache, and the place of a minimum takes
     # longer to find than its value: first the nearest group of rows, chunk by chunk, then the row within the group
-    padding = -len(table) % NEAREST_ROW_GROUP
-    table, squares = F.pad(table, (0, 0, 0, padding)), F.pad(squares, (0, padding), value=th.inf)
-    chunks = zip(table.split(NEAREST_ROW_CHUNK), squares.split(NEAREST_ROW_CHUNK), strict=True)
-    of_groups = [th.addmm(s, points, t.t(), alpha=-2).view(len(points), -1, NEAREST_ROW_GROUP).amin(dim=2) for t, s in chunks]
+    padding = -len(rows) % NEAREST_ROW_GROUP
+    rows = th.cat([rows, F.pad(rows.new_zeros(padding, rows.shape[1] - 1), (0, 1), value=th.inf)])
+    of_groups = [
+        th.mm(points, chunk.t()).view(len(points), -1, NEAREST_ROW_GROUP).amin(dim=2)
+        for chunk in rows.split(NEAREST_ROW_CHUNK)
+    ]
     group = th.cat(of_groups, dim=1).argmin(dim=1)
-    rows = table.view(-1, NEAREST_ROW_GROUP, table.shape[1])[group]
-    distances = squares.view(-1, NEAREST_ROW_GROUP)[group] - 2 * th.bmm(rows, points[:, :, None]).squeeze(2)
-    return group * NEAREST_ROW_GROUP + distances.argmin(dim=1)
+    candidates = rows.view(-1, NEAREST_ROW_GROUP, rows.shape[1])[group]
+    return group * NEAREST_ROW_GROUP + th.bmm(candidates, points[:, :, None]).squeeze(2).argmin(dim=1)
 
 
 def hash_observations(observations: PyTorchObs) -> th.Tensor:
