@@ -10,6 +10,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from torch.nn import functional as F
 
 from sb3_chdp import CHDP
+from sb3_chdp.chdp import losses
 from sb3_chdp.chdp.codebook import Codebook
 from sb3_chdp.common.utils import hash_observations
 from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, make_layout_env
@@ -47,15 +48,22 @@ def networks_with_gradient(model, loss):
     return result
 
 
-def losses(model):
-    data, _ = model._relabel(model._sample_batch(32))
+def batch_of(model, size=32):
+    return losses.relabel_latents(model.policy, model._sample_batch(size), model.relabel_latents)[0]
+
+
+def actions_of_continuous_loss(model, data):
     features = model.policy.actor_features(data.observations)
-    critic_features = model.critic.features(data.observations).detach()
-    critic_loss, _ = model._critic_loss(data)
-    discrete = model._discrete_policy_loss(data, features, critic_features)
-    continuous = model._continuous_policy_loss(data, features, critic_features)
+    return losses.continuous_policy_loss(model.policy, data, features, features, "q1", model.sequential_update)[2]
+
+
+def all_losses(model):
+    data, policy, q = batch_of(model), model.policy, model.improvement_q
+    features = (policy.actor_features(data.observations), model.critic.features(data.observations).detach())
+    discrete = losses.discrete_policy_loss(policy, data, *features, q)
+    continuous = losses.continuous_policy_loss(policy, data, *features, q, model.sequential_update)
     return {
-        "critic": critic_loss,
+        "critic": losses.critic_loss(policy, data)[0],
         "discrete diffusion": discrete[0],
         "discrete improvement": discrete[1],
         "continuous diffusion": continuous[0],
@@ -77,7 +85,7 @@ GRADIENTS = {
 @pytest.mark.parametrize("loss", GRADIENTS)
 def test_gradient_routing(loss):
     model = filled_model()
-    assert networks_with_gradient(model, losses(model)[loss]) == GRADIENTS[loss]
+    assert networks_with_gradient(model, all_losses(model)[loss]) == GRADIENTS[loss]
 
 
 def test_codebook_gradient_comes_through_the_continuous_chain_only():
@@ -85,7 +93,7 @@ def test_codebook_gradient_comes_through_the_continuous_chain_only():
     model = filled_model()
     with th.no_grad():
         model.actor.continuous_policy.noise_predictor.condition_weight.zero_()
-    assert "codebook" not in networks_with_gradient(model, losses(model)["continuous improvement"])
+    assert "codebook" not in networks_with_gradient(model, all_losses(model)["continuous improvement"])
 
 
 def test_each_step_moves_its_own_networks_only():
@@ -105,36 +113,31 @@ def test_each_step_moves_its_own_networks_only():
     assert policy.codebook_optimizer is not None
 
 
-def test_continuous_step_sees_the_updated_discrete_policy():
+def test_continuous_step_sees_the_updated_discrete_policy(monkeypatch):
     """The latents of step 2 are those that the discrete policy draws after its own step."""
     model = filled_model()
     seen = []
-    original = model._continuous_policy_loss
+    original = losses.continuous_policy_loss
 
-    def spy(data, features, critic_features):
-        weights = [p.detach().clone() for p in model.actor.discrete_policy.parameters()]
-        result = original(data, features, critic_features)
-        seen.append((weights, result[2]))
-        return result
+    def spy(*args):
+        seen.append([p.detach().clone() for p in model.actor.discrete_policy.parameters()])
+        return original(*args)
 
-    model._continuous_policy_loss = spy
+    monkeypatch.setattr("sb3_chdp.chdp.chdp.continuous_policy_loss", spy)
     before = [p.detach().clone() for p in model.actor.discrete_policy.parameters()]
     model.train(1, 32)
-    weights, _ = seen[0]
-    assert any((a != b).any() for a, b in zip(weights, before, strict=True))
+    assert any((a != b).any() for a, b in zip(seen[0], before, strict=True))
     # And it does draw from it: a policy that is forced to action 2 leaves nothing else
     force_action(model, 2)
-    data, _ = model._relabel(model._sample_batch(32))
-    features = model.policy.actor_features(data.observations)
-    assert (original(data, features, features)[2] == 2).all()
+    data = batch_of(model)
+    assert (actions_of_continuous_loss(model, data) == 2).all()
     assert (data.discrete_actions != 2).any()
 
 
 def test_without_sequential_update_the_stored_actions_are_used():
     model = filled_model(sequential_update=False)
-    data, _ = model._relabel(model._sample_batch(32))
-    features = model.policy.actor_features(data.observations)
-    assert (model._continuous_policy_loss(data, features, features)[2] == data.discrete_actions).all()
+    data = batch_of(model)
+    assert (actions_of_continuous_loss(model, data) == data.discrete_actions).all()
 
 
 def force_action(model, k):
@@ -147,7 +150,7 @@ def force_action(model, k):
 def test_critic_target():
     """y = r + gamma (1 - d) min Q' of the target policies' next action; n-step discounts take the place of gamma."""
     model = filled_model(gamma=0.9)
-    data, _ = model._relabel(model._sample_batch(32))
+    data = batch_of(model)
     data = data._replace(dones=(th.arange(32)[:, None] % 2).float())
     force_action(model, 1)
     model.actor_target.continuous_policy.sample = lambda condition, noise=None, mask=None: th.full((len(condition), 1), 0.3)
@@ -157,10 +160,10 @@ def test_critic_target():
         y = data.rewards + 0.9 * (1 - data.dones) * th.min(q1, q2)
         ours = model.critic.q_values(data.observations, data.latents, data.parameters)
         expected = sum(F.mse_loss(q, y) for q in ours)
-    loss, q_values = model._critic_loss(data)
+    loss, q_values = losses.critic_loss(model.policy, data)
     th.testing.assert_close(loss.detach(), expected)
     th.testing.assert_close(q_values, ours[0])
-    shorter = model._critic_loss(data._replace(discounts=th.full((32, 1), 0.1)))[0]
+    shorter = losses.critic_loss(model.policy, data._replace(discounts=th.full((32, 1), 0.1)))[0]
     assert not th.isclose(shorter, loss)
 
 
@@ -227,13 +230,12 @@ def test_relabelling_of_latents():
     assert (model.actor.codebook.quantize(data.latents) == data.discrete_actions).all(), "random actions decode to themselves"
     with th.no_grad():
         model.actor.codebook.codewords.copy_(-model.actor.codebook.codewords)
-    relabelled, drift = model._relabel(data)
+    relabelled, drift = losses.relabel_latents(model.policy, data, True)
     assert 0 < drift <= 1
     assert (model.actor.codebook.quantize(relabelled.latents) == data.discrete_actions).all()
     unchanged = model.actor.codebook.quantize(data.latents) == data.discrete_actions
     assert (relabelled.latents[unchanged] == data.latents[unchanged]).all()
-    model.relabel_latents = False
-    assert (model._relabel(data)[0].latents == data.latents).all()
+    assert (losses.relabel_latents(model.policy, data, False)[0].latents == data.latents).all()
 
 
 def test_padding_reaches_nothing():

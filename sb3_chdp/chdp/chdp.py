@@ -8,18 +8,21 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, update_learning_rate
-from torch.nn import functional as F
 
+from sb3_chdp.chdp.losses import (
+    IMPROVEMENT_QS,
+    continuous_policy_loss,
+    critic_loss,
+    discrete_policy_loss,
+    relabel_latents,
+)
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, CooperativeActor, MlpPolicy, MultiInputPolicy
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.policies import HybridCritic
-from sb3_chdp.common.type_aliases import HybridReplaySamples
 from sb3_chdp.common.utils import polyak_update
 
 SelfCHDP = TypeVar("SelfCHDP", bound="CHDP")
-
-IMPROVEMENT_QS = ("q1", "min", "mean")
 
 
 class CHDP(HybridOffPolicyAlgorithm):
@@ -248,12 +251,12 @@ class CHDP(HybridOffPolicyAlgorithm):
         logs: dict[str, list[th.Tensor]] = {}
         for _ in range(gradient_steps):
             self._n_updates += 1
-            replay_data, drift = self._relabel(self._sample_batch(batch_size))
+            replay_data, drift = relabel_latents(policy, self._sample_batch(batch_size), self.relabel_latents)
 
             # Step 0: critics
-            critic_loss, q_values = self._critic_loss(replay_data)
-            self._optimize(critic_loss, policy.critic.optimizer)
-            losses = {"critic_loss": critic_loss, "q_mean": q_values.mean(), "latent_drift": drift}
+            loss, q_values = critic_loss(policy, replay_data)
+            self._optimize(loss, policy.critic.optimizer)
+            losses = {"critic_loss": loss, "q_mean": q_values.mean(), "latent_drift": drift}
 
             if self._n_updates % self.policy_delay == 0:
                 # alpha of eq. dql_q_loss
@@ -261,19 +264,22 @@ class CHDP(HybridOffPolicyAlgorithm):
                 actor_features = policy.actor_features(replay_data.observations)
                 with th.no_grad():
                     critic_features = self.critic.features(replay_data.observations)
+                features = (actor_features, critic_features)
 
                 # Step 1: discrete policy
-                diffusion_loss, q_loss = self._discrete_policy_loss(replay_data, actor_features, critic_features)
-                discrete_loss = diffusion_loss + alpha * q_loss
-                self._optimize(discrete_loss, policy.discrete_optimizer)
-                losses |= {"discrete_loss": discrete_loss, "diffusion_loss_discrete": diffusion_loss}
+                diffusion_loss, q_loss = discrete_policy_loss(policy, replay_data, *features, self.improvement_q)
+                loss = diffusion_loss + alpha * q_loss
+                self._optimize(loss, policy.discrete_optimizer)
+                losses |= {"discrete_loss": loss, "diffusion_loss_discrete": diffusion_loss}
 
                 # Step 2: continuous policy and codebook, given the updated discrete policy
-                diffusion_loss, q_loss, k = self._continuous_policy_loss(replay_data, actor_features, critic_features)
-                continuous_loss = diffusion_loss + alpha * q_loss
-                self._optimize(continuous_loss, policy.continuous_optimizer, policy.codebook_optimizer)
+                diffusion_loss, q_loss, k = continuous_policy_loss(
+                    policy, replay_data, *features, self.improvement_q, self.sequential_update
+                )
+                loss = diffusion_loss + alpha * q_loss
+                self._optimize(loss, policy.continuous_optimizer, policy.codebook_optimizer)
                 self.actor.codebook.project()
-                losses |= {"continuous_loss": continuous_loss, "diffusion_loss_continuous": diffusion_loss}
+                losses |= {"continuous_loss": loss, "diffusion_loss_continuous": diffusion_loss}
 
                 polyak_update(self._online_params, self._target_params, self.tau)
                 # Copy running stats, see SB3's GH issue #996
@@ -296,84 +302,6 @@ class CHDP(HybridOffPolicyAlgorithm):
             rate = self.codebook_lr_schedule(self._current_progress_remaining)
             update_learning_rate(policy.codebook_optimizer, rate)
             self.logger.record("train/codebook_learning_rate", rate)
-
-    def _relabel(self, replay_data: HybridReplaySamples) -> tuple[HybridReplaySamples, th.Tensor]:
-        """
-        Replace latents that the codebook has moved away from.
-
-        :return: the batch, and the share of its latents that do not decode to the stored action
-        """
-        codebook = self.actor.codebook
-        drifted = codebook.quantize(replay_data.latents) != replay_data.discrete_actions
-        if self.relabel_latents:
-            present = codebook.representative_latents(replay_data.discrete_actions)
-            replay_data = replay_data._replace(latents=th.where(drifted[:, None], present, replay_data.latents))
-        return replay_data, drifted.float().mean()
-
-    def _critic_loss(self, replay_data: HybridReplaySamples) -> tuple[th.Tensor, th.Tensor]:
-        """
-        Mean squared Bellman errors (eq. CHDP_critic_loss_overview).
-
-        :return: their sum over both critics, and the detached (B, 1) values of the first
-        """
-        with th.no_grad():
-            # Next action of the target policies
-            next_features = self.actor_target.features(replay_data.next_observations)
-            next_latents, _, next_parameters = self.actor_target.sample(next_features)
-            # Compute the next Q-values: min over both target critics
-            next_critic_features = self.critic_target.features(replay_data.next_observations)
-            next_q_values = th.min(*self.critic_target.q_values(next_critic_features, next_latents, next_parameters))
-            target_q_values = replay_data.rewards + (1 - replay_data.dones) * replay_data.discounts * next_q_values
-        features = self.critic.features(replay_data.observations)
-        q1, q2 = self.critic.q_values(features, replay_data.latents, replay_data.parameters)
-        return F.mse_loss(q1, target_q_values) + F.mse_loss(q2, target_q_values), q1.detach()
-
-    def _discrete_policy_loss(
-        self, replay_data: HybridReplaySamples, actor_features: th.Tensor, critic_features: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor]:
-        """
-        Eq. discrete_policy_loss_chdp_final: Q of latents drawn through the whole chain, with the stored parameters.
-
-        :return: diffusion loss and policy improvement loss
-        """
-        policy = self.actor.discrete_policy
-        diffusion_loss = policy.diffusion_loss(replay_data.latents, actor_features)
-        latents = policy.sample(actor_features)
-        q_loss = -self._improvement_q(critic_features, latents, replay_data.parameters).mean()
-        return diffusion_loss, q_loss
-
-    def _continuous_policy_loss(
-        self, replay_data: HybridReplaySamples, actor_features: th.Tensor, critic_features: th.Tensor
-    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        """
-        Eq. continuous_policy_loss_chdp_final: Q of parameters drawn through the whole chain, given latents of the updated
-        discrete policy; the gradient reaches the codebook through the condition of the chain.
-
-        :return: diffusion loss, policy improvement loss, and the (B,) discrete actions
-        """
-        actor = self.actor
-        # The features extractor belongs to the discrete policy
-        actor_features = actor_features.detach()
-        stored_k = replay_data.discrete_actions
-        condition = th.cat([actor_features, actor.codebook(stored_k).detach()], dim=1)
-        diffusion_loss = actor.continuous_policy.diffusion_loss(replay_data.parameters, condition, actor.mask(stored_k))
-
-        if self.sequential_update:
-            with th.no_grad():
-                latents = actor.discrete_policy.sample(actor_features)
-                k = actor.codebook.quantize(latents)
-        else:
-            latents, k = replay_data.latents, stored_k
-        parameters = actor.sample_parameters(actor_features, k)
-        q_loss = -self._improvement_q(critic_features, latents, parameters).mean()
-        return diffusion_loss, q_loss, k
-
-    def _improvement_q(self, critic_features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-        """:return: (B, 1) the Q that the policies ascend; gradient flows to the action only"""
-        if self.improvement_q == "q1":
-            return self.critic.q_networks[0](th.cat([critic_features, latents, parameters], dim=1))
-        q1, q2 = self.critic.q_values(critic_features, latents, parameters)
-        return th.min(q1, q2) if self.improvement_q == "min" else 0.5 * (q1 + q2)
 
     def _optimize(self, loss: th.Tensor, *optimizers: th.optim.Optimizer | None) -> None:
         """One gradient step of the parameters of the given optimizers, and of no others."""

@@ -1,0 +1,123 @@
+"""The losses of CHDP, one function for each of the paper's equations, and the relabelling of stored latents."""
+
+import torch as th
+from torch.nn import functional as F
+
+from sb3_chdp.chdp.policies import CHDPPolicy
+from sb3_chdp.common.policies import HybridCritic
+from sb3_chdp.common.type_aliases import HybridReplaySamples
+
+IMPROVEMENT_QS = ("q1", "min", "mean")
+
+
+def relabel_latents(
+    policy: CHDPPolicy, replay_data: HybridReplaySamples, replace: bool
+) -> tuple[HybridReplaySamples, th.Tensor]:
+    """
+    Look for latents that the codebook has moved away from.
+
+    :param policy: the networks
+    :param replay_data: a batch
+    :param replace: whether such latents give way to the present codeword of the stored action
+    :return: the batch, and the share of its latents that do not decode to the stored action
+    """
+    codebook = policy.actor.codebook
+    drifted = codebook.quantize(replay_data.latents) != replay_data.discrete_actions
+    if replace:
+        present = codebook.representative_latents(replay_data.discrete_actions)
+        replay_data = replay_data._replace(latents=th.where(drifted[:, None], present, replay_data.latents))
+    return replay_data, drifted.float().mean()
+
+
+def critic_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Mean squared Bellman errors (eq. CHDP_critic_loss_overview).
+
+    :param policy: the networks
+    :param replay_data: a batch
+    :return: their sum over both critics, and the detached (B, 1) values of the first
+    """
+    critic, critic_target, actor_target = policy.critic, policy.critic_target, policy.actor_target
+    with th.no_grad():
+        # Next action of the target policies
+        next_features = actor_target.features(replay_data.next_observations)
+        next_latents, _, next_parameters = actor_target.sample(next_features)
+        # Compute the next Q-values: min over both target critics
+        next_critic_features = critic_target.features(replay_data.next_observations)
+        next_q_values = th.min(*critic_target.q_values(next_critic_features, next_latents, next_parameters))
+        target_q_values = replay_data.rewards + (1 - replay_data.dones) * replay_data.discounts * next_q_values
+    features = critic.features(replay_data.observations)
+    q1, q2 = critic.q_values(features, replay_data.latents, replay_data.parameters)
+    return F.mse_loss(q1, target_q_values) + F.mse_loss(q2, target_q_values), q1.detach()
+
+
+def discrete_policy_loss(
+    policy: CHDPPolicy,
+    replay_data: HybridReplaySamples,
+    actor_features: th.Tensor,
+    critic_features: th.Tensor,
+    improvement_q: str,
+) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Eq. discrete_policy_loss_chdp_final: Q of latents drawn through the whole chain, with the stored parameters.
+
+    :param policy: the networks
+    :param replay_data: a batch
+    :param actor_features: (B, features_dim) features of the policies
+    :param critic_features: (B, features_dim) features of the critics
+    :param improvement_q: one of ``IMPROVEMENT_QS``
+    :return: diffusion loss and policy improvement loss
+    """
+    discrete_policy = policy.actor.discrete_policy
+    diffusion_loss = discrete_policy.diffusion_loss(replay_data.latents, actor_features)
+    latents = discrete_policy.sample(actor_features)
+    q_values = q_to_ascend(policy.critic, critic_features, latents, replay_data.parameters, improvement_q)
+    return diffusion_loss, -q_values.mean()
+
+
+def continuous_policy_loss(
+    policy: CHDPPolicy,
+    replay_data: HybridReplaySamples,
+    actor_features: th.Tensor,
+    critic_features: th.Tensor,
+    improvement_q: str,
+    sequential_update: bool,
+) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+    """
+    Eq. continuous_policy_loss_chdp_final: Q of parameters drawn through the whole chain, given latents of the updated
+    discrete policy; the gradient reaches the codebook through the condition of the chain.
+
+    :param policy: the networks
+    :param replay_data: a batch
+    :param actor_features: (B, features_dim) features of the policies
+    :param critic_features: (B, features_dim) features of the critics
+    :param improvement_q: one of ``IMPROVEMENT_QS``
+    :param sequential_update: False takes the stored latents and actions instead
+    :return: diffusion loss, policy improvement loss, and the (B,) discrete actions
+    """
+    actor = policy.actor
+    # The features extractor belongs to the discrete policy
+    actor_features = actor_features.detach()
+    stored_k = replay_data.discrete_actions
+    condition = th.cat([actor_features, actor.codebook(stored_k).detach()], dim=1)
+    diffusion_loss = actor.continuous_policy.diffusion_loss(replay_data.parameters, condition, actor.mask(stored_k))
+
+    if sequential_update:
+        with th.no_grad():
+            latents = actor.discrete_policy.sample(actor_features)
+            k = actor.codebook.quantize(latents)
+    else:
+        latents, k = replay_data.latents, stored_k
+    parameters = actor.sample_parameters(actor_features, k)
+    q_values = q_to_ascend(policy.critic, critic_features, latents, parameters, improvement_q)
+    return diffusion_loss, -q_values.mean(), k
+
+
+def q_to_ascend(
+    critic: HybridCritic, critic_features: th.Tensor, latents: th.Tensor, parameters: th.Tensor, improvement_q: str
+) -> th.Tensor:
+    """:return: (B, 1) the Q that the policies ascend; gradient flows to the action only"""
+    if improvement_q == "q1":
+        return critic.q_networks[0](th.cat([critic_features, latents, parameters], dim=1))
+    q1, q2 = critic.q_values(critic_features, latents, parameters)
+    return th.min(q1, q2) if improvement_q == "min" else 0.5 * (q1 + q2)
