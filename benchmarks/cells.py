@@ -34,6 +34,8 @@ ALGORITHMS = {
     "hyar_td3": sb3_chdp.HyARTD3,
 }
 FIELDS = ("timesteps", "gradient_steps", "success", "return", "length", "seconds")
+# Evaluations of a run; its score is the mean of the last five
+N_EVALUATIONS = 30
 # Wall-clock seconds between two checkpoints
 CHECKPOINT_INTERVAL = 180.0
 
@@ -47,7 +49,7 @@ class Cell:
     :param seed: seed of the model and of the training environments
     :param out: folder of the table
     :param overrides: hyperparameters that differ from the YAML file
-    :param eval_freq: environment steps between two evaluations
+    :param eval_freq: environment steps between two evaluations, a thirtieth of the training if None
     :param eval_episodes: episodes of an evaluation
     """
 
@@ -57,7 +59,7 @@ class Cell:
     seed: int
     out: str
     overrides: dict[str, Any] = field(default_factory=dict)
-    eval_freq: int = 5000
+    eval_freq: int | None = None
     eval_episodes: int = 100
 
     @property
@@ -79,6 +81,10 @@ class Cell:
     @property
     def total_steps(self) -> int:
         return int(self.settings()["n_timesteps"])
+
+    @property
+    def steps_between_evaluations(self) -> int:
+        return self.eval_freq or max(self.total_steps // N_EVALUATIONS, 1)
 
     def rows(self) -> list[dict[str, float]]:
         """:return: the evaluations so far"""
@@ -121,7 +127,8 @@ class CurveCallback(BaseCallback):
         super().__init__()
         self.cell = cell
         self.eval_env = make_vec_env(cell.env_id, 8, seed=10_000 + cell.seed)
-        self.next_evaluation = (len(rows) + 1) * cell.eval_freq
+        self.eval_freq = cell.steps_between_evaluations
+        self.next_evaluation = (len(rows) + 1) * self.eval_freq
         self.seconds = rows[-1]["seconds"] if rows else 0.0
         self.started = self.last_checkpoint = time.perf_counter()
         with cell.path(".csv").open("w", newline="") as file:
@@ -131,7 +138,7 @@ class CurveCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         if self.num_timesteps >= self.next_evaluation:
-            self.next_evaluation += self.cell.eval_freq
+            self.next_evaluation += self.eval_freq
             self.evaluate()
         return True
 

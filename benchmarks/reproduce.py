@@ -87,7 +87,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--envs", nargs="+", choices=ENV_IDS, metavar="ENV", help=", ".join(ENV_IDS))
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--steps", type=int, help="environment steps (default: those of the YAML file)")
-    parser.add_argument("--eval-freq", type=int, default=5000)
+    parser.add_argument("--eval-freq", type=int, help="steps between evaluations (default: 30 evaluations)")
     parser.add_argument("--eval-episodes", type=int, default=100)
     parser.add_argument("--jobs", type=int, default=1, help="cells at a time, one thread each")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="override hyperparameters (YAML values)")
