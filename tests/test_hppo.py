@@ -138,3 +138,9 @@ def test_masks_that_the_environment_has_not():
 def test_batch_size_of_one():
     with pytest.raises(ValueError, match="batch_size"):
         make_model(HPPO, make_layout_env(), batch_size=1)
+
+
+def test_masks_of_the_wrong_shape(monkeypatch):
+    monkeypatch.setattr(MaskedEnv, "action_masks", lambda self: np.ones(2, dtype=bool))
+    with pytest.raises(ValueError, match=r"action_masks\(\) must give \(n_envs, K\) = \(1, 3\)"):
+        make_model(HPPO, MaskedEnv()).learn(10)

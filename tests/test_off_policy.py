@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_chdp import CHDP
 from tests.algorithms import OFF_POLICY_ALGORITHMS, make_model
@@ -65,3 +67,15 @@ def test_exploration_noise_schedule(name, final, initial, expected):
         assert model.exploration_noise_schedule(progress) == pytest.approx(std)
         model._current_progress_remaining = progress
         assert model._draw_noise(5000).std() == pytest.approx(std, rel=0.1)
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_action_noise_of_the_user(off_policy_algorithm, n_envs):
+    env = make_vec_env(make_layout_env, n_envs)
+    size = make_model(off_policy_algorithm, env).policy.noise_dim
+    noise = NormalActionNoise(np.zeros(size), np.full(size, 0.3))
+    make_model(off_policy_algorithm, env, action_noise=noise).learn(30)
+    wrong = NormalActionNoise(np.zeros(size + 1), np.full(size + 1, 0.3))
+    model = make_model(off_policy_algorithm, env, action_noise=wrong, exploration_initial_eps=0, exploration_final_eps=0)
+    with pytest.raises(ValueError, match=f"action_noise must have size {size} per environment"):
+        model.learn(30)

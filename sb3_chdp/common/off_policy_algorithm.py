@@ -122,6 +122,11 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         else:
             assert self._last_obs is not None, "self._last_obs was not set"
             noise = self._draw_noise(n_envs) if action_noise is None else action_noise()
+            if noise is not None and np.size(noise) != n_envs * self.policy.noise_dim:
+                raise ValueError(
+                    f"action_noise must have size {self.policy.noise_dim} per environment, got shape {np.shape(noise)} "
+                    f"for {n_envs} environment(s)"
+                )
             if noise is None:
                 rows = self.policy.predict_rows(self._last_obs)  # type: ignore[arg-type]
             else:

@@ -22,7 +22,8 @@ class NativeActionVecEnv(VecEnvWrapper):
     :param action_space: space of the rows
     :param set_action_masks: called with the (n_envs, K) action masks of the environment now and after every step; None
         if the environment has none
-    :raises ValueError: from ``step`` if an observation or a reward is not finite, before anything is stored
+    :raises ValueError: for masks of another shape; from ``step`` if an observation or a reward is not finite, before
+        anything is stored
     """
 
     def __init__(self, venv: VecEnv, action_space: HybridBox, set_action_masks: Callable[[np.ndarray], None] | None = None):
@@ -33,7 +34,11 @@ class NativeActionVecEnv(VecEnvWrapper):
 
     def _update_masks(self) -> None:
         if self.set_action_masks is not None:
-            self.set_action_masks(get_action_masks(self.venv))
+            masks = get_action_masks(self.venv)
+            expected = (self.num_envs, self.rows.spec.n_discrete_actions)
+            if masks.shape != expected:
+                raise ValueError(f"action_masks() must give (n_envs, K) = {expected} booleans, got shape {masks.shape}")
+            self.set_action_masks(masks)
 
     def reset(self) -> VecEnvObs:
         return self.venv.reset()

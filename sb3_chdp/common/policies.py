@@ -75,7 +75,7 @@ class HybridPolicy(BasePolicy):
     @property
     def noise_dim(self) -> int:
         """Width of the action noise that :meth:`noisy_rows` takes"""
-        return self.action_space.shape[0]
+        return self.action_space.spec.max_parameters
 
     def noisy_rows(self, observation: np.ndarray | dict[str, np.ndarray], noise: np.ndarray) -> np.ndarray:
         """

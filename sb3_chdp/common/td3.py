@@ -62,6 +62,10 @@ class HybridTD3Policy(HybridPolicy, TD3Policy):
             actor.mu = nn.Sequential(*actor.mu, InvertingGradients())
         return actor
 
+    @property
+    def noise_dim(self) -> int:
+        return self.action_space.shape[0]
+
     def noisy_rows(self, observation: np.ndarray | dict[str, np.ndarray], noise: np.ndarray) -> np.ndarray:
         self.set_training_mode(False)
         obs_tensor, _ = self.obs_to_tensor(observation)
