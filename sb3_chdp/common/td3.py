@@ -86,10 +86,17 @@ class HybridTD3(HybridOffPolicyAlgorithm, TD3):
     """
     Base class: SB3's TD3 on hybrid actions, by default on the space of K scores and P parameters.
 
-    The parameters are those of :class:`stable_baselines3.TD3` and :class:`HybridOffPolicyAlgorithm`, and
+    Parameters not listed here are those of :class:`stable_baselines3.TD3`.
 
-    :param exploration_noise: standard deviation of the Gaussian noise on the actor's output, if no ``action_noise`` is
-        given
+    :param target_policy_noise: standard deviation of the noise on the target actor's output (smoothing); 0: none
+    :param policy_delay: actor and targets are updated once every ``policy_delay`` critic updates
+    :param action_noise: noise on the actor's output, in place of the Gaussian one
+    :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
+    :param exploration_fraction: fraction of the training over which the rate of uniformly random actions is reduced
+    :param exploration_initial_eps: initial probability of a uniformly random action
+    :param exploration_final_eps: final probability of a uniformly random action
+    :param exploration_noise: standard deviation of the Gaussian noise on the actor's output (scores and parameters,
+        parameters, or latents), if no ``action_noise`` is given
     :param exploration_initial_noise: initial standard deviation, which falls linearly to ``exploration_noise`` over
         ``exploration_fraction``; None: constant
     :param inverting_gradients: whether the gradients at the actor's output are inverted

@@ -28,17 +28,7 @@ class HHQNTD3(HybridTD3):
         7. uniformly random actions with a decreasing probability (``exploration_*``; initial and final rate 0: the scripts);
         8. plain policy gradients; ``inverting_gradients=True`` for inverted ones, no clipping of gradient norms.
 
-    The parameters are those of :class:`stable_baselines3.TD3`, and
-
-    :param exploration_noise: standard deviation of the Gaussian noise on scores and parameters, if no ``action_noise`` (of
-        size K + P) is given
-    :param exploration_initial_noise: initial standard deviation, which falls linearly to ``exploration_noise`` over
-        ``exploration_fraction``; None: constant
-    :param inverting_gradients: whether the gradients at the outputs of both actors are inverted
-    :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
-    :param exploration_fraction: fraction of the training over which the rate of uniformly random actions is reduced
-    :param exploration_initial_eps: initial probability of a uniformly random action
-    :param exploration_final_eps: final probability of a uniformly random action
+    The parameters are those of :class:`HybridTD3`.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

@@ -6,8 +6,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
@@ -70,8 +68,11 @@ class HyARTD3(HybridTD3):
     With n-step returns the representation predicts the change of the state over n steps. Observations other than vectors
     are represented by the features of the target critic.
 
-    The parameters are those of :class:`stable_baselines3.TD3`, and
+    The parameters are those of :class:`HybridTD3`, all but the first three by keyword, and
 
+    :param buffer_size: size of the replay buffer, which also feeds the representation
+    :param learning_starts: number of random steps at first; the representation is warmed up on them
+    :param target_policy_noise: standard deviation of the noise on the target latents
     :param embedding_dim: width of the embedding of a discrete action
     :param parameter_latent_dim: width of the latent z of the parameters
     :param representation_learning_rate: learning rate of the representation
@@ -79,15 +80,6 @@ class HyARTD3(HybridTD3):
     :param representation_warmup_steps: its gradient steps before TD3 begins
     :param representation_freq: it is updated again every ``representation_freq`` gradient steps of TD3
     :param representation_steps: number of its gradient steps then
-    :param exploration_noise: standard deviation of the Gaussian noise on the latents, if no ``action_noise`` (of size
-        ``embedding_dim + parameter_latent_dim``) is given
-    :param exploration_initial_noise: initial standard deviation, which falls linearly to ``exploration_noise`` over
-        ``exploration_fraction``; None: constant
-    :param inverting_gradients: whether the gradients at the actor's output are inverted
-    :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
-    :param exploration_fraction: fraction of the training over which the rate of uniformly random actions is reduced
-    :param exploration_initial_eps: initial probability of a uniformly random action
-    :param exploration_final_eps: final probability of a uniformly random action
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -102,21 +94,10 @@ class HyARTD3(HybridTD3):
         policy: str | type[HyARTD3Policy],
         env: GymEnv | str,
         learning_rate: float | Schedule = 3e-4,
+        *,
         buffer_size: int = 1_000_000,  # 1e6
         learning_starts: int = 5000,
-        batch_size: int = 128,
-        tau: float = 0.005,
-        gamma: float = 0.99,
-        train_freq: int | tuple[int, str] = 1,
-        gradient_steps: int = 1,
-        action_noise: ActionNoise | None = None,
-        replay_buffer_class: type[ReplayBuffer] | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
-        optimize_memory_usage: bool = False,
-        n_steps: int = 1,
-        policy_delay: int = 2,
         target_policy_noise: float = 0.1,
-        target_noise_clip: float = 0.5,
         embedding_dim: int = 6,
         parameter_latent_dim: int = 6,
         representation_learning_rate: float | Schedule = 1e-4,
@@ -124,54 +105,18 @@ class HyARTD3(HybridTD3):
         representation_warmup_steps: int = 5000,
         representation_freq: int = 500,
         representation_steps: int = 5,
-        exploration_noise: float = 0.1,
-        exploration_initial_noise: float | None = None,
-        inverting_gradients: bool = False,
-        action_layout: str = "auto",
-        exploration_fraction: float = 0.2,
-        exploration_initial_eps: float = 1.0,
-        exploration_final_eps: float = 0.05,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: th.device | str = "auto",
         _init_setup_model: bool = True,
+        **kwargs: Any,
     ):
         super().__init__(
             policy,
             env,
             learning_rate,
-            buffer_size,
-            learning_starts,
-            batch_size,
-            tau,
-            gamma,
-            train_freq,
-            gradient_steps,
-            action_noise=action_noise,
-            replay_buffer_class=replay_buffer_class,
-            replay_buffer_kwargs=replay_buffer_kwargs,
-            optimize_memory_usage=optimize_memory_usage,
-            n_steps=n_steps,
-            policy_delay=policy_delay,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
             target_policy_noise=target_policy_noise,
-            target_noise_clip=target_noise_clip,
-            exploration_noise=exploration_noise,
-            exploration_initial_noise=exploration_initial_noise,
-            inverting_gradients=inverting_gradients,
-            action_layout=action_layout,
-            exploration_fraction=exploration_fraction,
-            exploration_initial_eps=exploration_initial_eps,
-            exploration_final_eps=exploration_final_eps,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_kwargs,
-            verbose=verbose,
-            seed=seed,
-            device=device,
             _init_setup_model=False,
+            **kwargs,
         )
         for name, value in (("embedding_dim", embedding_dim), ("parameter_latent_dim", parameter_latent_dim)):
             if value < 1:

@@ -3,8 +3,6 @@
 from typing import Any, ClassVar
 
 import torch as th
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
@@ -47,22 +45,15 @@ class PDQNTD3(HybridTD3):
         8. no clipping of gradient norms;
         9. the K passes of ``multi_pass`` share what they have in common; the values are the same.
 
-    The parameters are those of :class:`stable_baselines3.TD3`, and
+    The parameters are those of :class:`HybridTD3`, all but the first three by keyword, and
 
+    :param gamma: the discount factor
     :param actor_learning_rate: learning rate of the actor; ``learning_rate`` is the one of the Q-networks
-    :param exploration_noise: standard deviation of the Gaussian noise on the parameters, if no ``action_noise`` (of size
-        P) is given
-    :param exploration_initial_noise: initial standard deviation, which falls linearly to ``exploration_noise`` over
-        ``exploration_fraction``; None: constant
     :param inverting_gradients: True: the actor's outputs are linear and clamped to [-1, 1], with inverted gradients;
         False: tanh and plain gradients
     :param multi_pass: whether Q of an action sees the parameters of that action only (MP-DQN)
     :param passthrough: ``dict(weight=..., bias=...)`` of a fixed linear function of the observation that is added to the
         actor's outputs, see :class:`ParameterActor`
-    :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
-    :param exploration_fraction: fraction of the training over which the rate of uniformly random actions is reduced
-    :param exploration_initial_eps: initial probability of a uniformly random action
-    :param exploration_final_eps: final probability of a uniformly random action
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -81,72 +72,23 @@ class PDQNTD3(HybridTD3):
         policy: str | type[PDQNTD3Policy],
         env: GymEnv | str,
         learning_rate: float | Schedule = 1e-3,
+        *,
         actor_learning_rate: float | Schedule = 1e-4,
-        buffer_size: int = 100_000,
-        learning_starts: int = 500,
-        batch_size: int = 128,
-        tau: float = 0.005,
         gamma: float = 0.95,
-        train_freq: int | tuple[int, str] = 1,
-        gradient_steps: int = 1,
-        action_noise: ActionNoise | None = None,
-        replay_buffer_class: type[ReplayBuffer] | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
-        optimize_memory_usage: bool = False,
-        n_steps: int = 1,
-        policy_delay: int = 2,
-        target_policy_noise: float = 0.2,
-        target_noise_clip: float = 0.5,
-        exploration_noise: float = 0.1,
-        exploration_initial_noise: float | None = None,
         inverting_gradients: bool = True,
         multi_pass: bool = False,
         passthrough: dict[str, Any] | None = None,
-        action_layout: str = "auto",
-        exploration_fraction: float = 0.2,
-        exploration_initial_eps: float = 1.0,
-        exploration_final_eps: float = 0.05,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: th.device | str = "auto",
         _init_setup_model: bool = True,
+        **kwargs: Any,
     ):
         super().__init__(
             policy,
             env,
             learning_rate,
-            buffer_size,
-            learning_starts,
-            batch_size,
-            tau,
-            gamma,
-            train_freq,
-            gradient_steps,
-            action_noise=action_noise,
-            replay_buffer_class=replay_buffer_class,
-            replay_buffer_kwargs=replay_buffer_kwargs,
-            optimize_memory_usage=optimize_memory_usage,
-            n_steps=n_steps,
-            policy_delay=policy_delay,
-            target_policy_noise=target_policy_noise,
-            target_noise_clip=target_noise_clip,
-            exploration_noise=exploration_noise,
-            exploration_initial_noise=exploration_initial_noise,
+            gamma=gamma,
             inverting_gradients=inverting_gradients,
-            action_layout=action_layout,
-            exploration_fraction=exploration_fraction,
-            exploration_initial_eps=exploration_initial_eps,
-            exploration_final_eps=exploration_final_eps,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_kwargs,
-            verbose=verbose,
-            seed=seed,
-            device=device,
             _init_setup_model=False,
+            **kwargs,
         )
         self.actor_learning_rate = actor_learning_rate
         self.multi_pass = multi_pass
