@@ -1,5 +1,5 @@
 """
-Tables and figures from the CSVs that reproduce.py leaves; the tables replace the section of benchmarks/README.md.
+Tables and figures from the CSVs that reproduce.py leaves; tables replace the sections of benchmarks/README.md and README.md.
 
     python benchmarks/tables.py             tables, figures/curves.png and figures/scores.png
     python benchmarks/tables.py --print     tables, printed only
@@ -95,6 +95,10 @@ def interval(scores: np.ndarray) -> tuple[float, float, float]:
     return float(point["x"][0]), float(bounds["x"][0, 0]), float(bounds["x"][1, 0])
 
 
+def mean_and_std(values: np.ndarray) -> str:
+    return f"{values.mean():.1f}" + (f" ± {values.std(ddof=1):.1f}" if len(values) > 1 else "")
+
+
 def markdown(table: str, scores: pd.DataFrame) -> str:
     """:return: one line per run group: ours beside the paper's"""
     lines = [
@@ -107,11 +111,9 @@ def markdown(table: str, scores: pd.DataFrame) -> str:
             if cell.empty:
                 continue
             successes = cell["success"].to_numpy()
-            std = successes.std(ddof=1) if len(successes) > 1 else float("nan")
-            entry = f"{successes.mean():.1f} ± {std:.1f}"
+            entry = mean_and_std(successes)
             if env_id == "Platform-v0":
-                returns = 100 * cell["return"].to_numpy()
-                entry += f" (return x 100: {returns.mean():.1f} ± {returns.std(ddof=1) if len(returns) > 1 else 0:.1f})"
+                entry += f" (return x 100: {mean_and_std(100 * cell['return'].to_numpy())})"
             iqm, low, high = interval(successes)
             singles = ", ".join(f"{value:.1f}" for value in successes)
             lines.append(
@@ -119,6 +121,26 @@ def markdown(table: str, scores: pd.DataFrame) -> str:
                 f"| {PAPER[table].get((row, env_id), '')} | {cell['timesteps'].max():,} | {cell['gradient_steps'].max():,} "
                 f"| {cell['seconds'].mean() / 60:.0f} |"
             )
+    return "\n".join(lines)
+
+
+def overview(scores: pd.DataFrame) -> str:
+    """:return: the README's table: a line per algorithm, a column per environment that has been run, the paper in brackets"""
+    envs = [env_id for env_id in ENV_IDS if env_id in set(scores["env"])]
+    lines = ["| algorithm | " + " | ".join(envs) + " |", "|---|" + "---|" * len(envs)]
+    for row in ROWS["main"]:
+        entries = []
+        for env_id in envs:
+            cell = scores[(scores["env"] == env_id) & (scores["row"] == row)]
+            if cell.empty:
+                entries.append(f"[{PAPER['main'][row, env_id]}]")
+                continue
+            entry = mean_and_std(cell["success"].to_numpy())
+            if env_id == "Platform-v0":
+                entry += f", return x 100: {mean_and_std(100 * cell['return'].to_numpy())}"
+            seeds = "" if len(cell) >= 3 else f", seeds: {len(cell)}"
+            entries.append(f"{entry} ({cell['timesteps'].max() / 1000:.0f} k steps{seeds}) [{PAPER['main'][row, env_id]}]")
+        lines.append(f"| {NAMES[row]} | " + " | ".join(entries) + " |")
     return "\n".join(lines)
 
 
@@ -130,7 +152,7 @@ def improvement(scores: pd.DataFrame) -> str:
             scores[(scores["env"] == env_id) & (scores["row"] == row)]["success"].to_numpy()[:, None]
             for row in ("chdp", "hyar_td3")
         )
-        if min(len(ours), len(theirs)) < 2:
+        if min(len(ours), len(theirs)) < 3:
             continue
         point, bounds = library.get_interval_estimates(
             {"x": (ours, theirs)}, metrics.probability_of_improvement, reps=BOOTSTRAP_REPEATS
@@ -199,8 +221,9 @@ def main() -> None:
     print(text)
     if args.only_print:
         return
-    before, rest = README.read_text().split(START)
-    README.write_text(f"{before}{START}\n{text}\n{END}{rest.split(END)[1]}")
+    for path, content in ((README, text), (ROOT.parent / "README.md", overview(scores))):
+        before, rest = path.read_text().split(START)
+        path.write_text(f"{before}{START}\n{content}\n{END}{rest.split(END)[1]}")
     FIGURES.mkdir(exist_ok=True)
     plot_curves(runs)
     plot_scores(scores)
