@@ -1,9 +1,8 @@
 """
 The reverse chain of a diffusion model with its backward pass written out.
 
-Back-propagation through N denoising steps is bound by memory: autograd keeps five tensors per step and layer pair, all in
-fresh memory. Here only what goes into the activations is kept, and the rest is computed again on the way back, in memory
-that every step uses again.
+Autograd keeps inputs and outputs of every operation of all N steps, in fresh memory. Here only what goes into the
+activations is kept, and the rest is computed again on the way back, in memory that every step uses again.
 """
 
 from typing import Any, NamedTuple
