@@ -10,6 +10,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, update_learning_rate
 
 from sb3_chdp.chdp.losses import (
+    IMPROVEMENT_PARAMETERS,
     IMPROVEMENT_QS,
     continuous_policy_loss,
     critic_loss,
@@ -68,6 +69,8 @@ class CHDP(HybridOffPolicyAlgorithm):
     :param variance_type: variance of a denoising step, "fixed_large" (the paper) or "fixed_small" (DDPM's posterior)
     :param eta: weight of the policy improvement terms relative to the diffusion losses
     :param improvement_q: which Q the policies ascend: "q1", "min" or "mean" of the two
+    :param improvement_parameters: parameters with which the discrete policy's latents are valued, "stored" (the paper)
+        or "policy": those that the continuous policy draws for them
     :param n_action_candidates: number of actions drawn per observation when acting; the one with the highest min(Q1, Q2)
         of the target critics is taken
     :param relabel_latents: whether a stored latent that does not decode to the stored discrete action any more is
@@ -132,6 +135,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         variance_type: str = "fixed_large",
         eta: float = 10.0,
         improvement_q: str = "q1",
+        improvement_parameters: str = "stored",
         n_action_candidates: int = 16,
         relabel_latents: bool = True,
         codebook_learning_rate: float | Schedule = 1e-4,
@@ -182,6 +186,10 @@ class CHDP(HybridOffPolicyAlgorithm):
         )
         if improvement_q not in IMPROVEMENT_QS:
             raise ValueError(f"improvement_q must be one of {IMPROVEMENT_QS}, got {improvement_q!r}")
+        if improvement_parameters not in IMPROVEMENT_PARAMETERS:
+            raise ValueError(
+                f"improvement_parameters must be one of {IMPROVEMENT_PARAMETERS}, got {improvement_parameters!r}"
+            )
         for name, value in (
             ("latent_dim", latent_dim),
             ("n_action_candidates", n_action_candidates),
@@ -195,6 +203,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         self.variance_type = variance_type
         self.eta = eta
         self.improvement_q = improvement_q
+        self.improvement_parameters = improvement_parameters
         self.n_action_candidates = n_action_candidates
         self.relabel_latents = relabel_latents
         self.codebook_learning_rate = codebook_learning_rate
@@ -267,7 +276,9 @@ class CHDP(HybridOffPolicyAlgorithm):
                 features = (actor_features, critic_features)
 
                 # Step 1: discrete policy
-                diffusion_loss, q_loss = discrete_policy_loss(policy, replay_data, *features, self.improvement_q)
+                diffusion_loss, q_loss = discrete_policy_loss(
+                    policy, replay_data, *features, self.improvement_q, self.improvement_parameters
+                )
                 loss = diffusion_loss + alpha * q_loss
                 self._optimize(loss, policy.discrete_optimizer)
                 losses |= {"discrete_loss": loss, "diffusion_loss_discrete": diffusion_loss}

@@ -8,6 +8,7 @@ from sb3_chdp.common.policies import HybridCritic
 from sb3_chdp.common.type_aliases import HybridReplaySamples
 
 IMPROVEMENT_QS = ("q1", "min", "mean")
+IMPROVEMENT_PARAMETERS = ("stored", "policy")
 
 
 def relabel_latents(
@@ -57,6 +58,7 @@ def discrete_policy_loss(
     actor_features: th.Tensor,
     critic_features: th.Tensor,
     improvement_q: str,
+    improvement_parameters: str,
 ) -> tuple[th.Tensor, th.Tensor]:
     """
     Eq. discrete_policy_loss_chdp_final: Q of latents drawn through the whole chain, with the stored parameters.
@@ -66,12 +68,18 @@ def discrete_policy_loss(
     :param actor_features: (B, features_dim) features of the policies
     :param critic_features: (B, features_dim) features of the critics
     :param improvement_q: one of ``IMPROVEMENT_QS``
+    :param improvement_parameters: one of ``IMPROVEMENT_PARAMETERS``; "policy" takes the parameters that the continuous
+        policy draws for the drawn latents instead, without gradient
     :return: diffusion loss and policy improvement loss
     """
     discrete_policy = policy.actor.discrete_policy
     diffusion_loss = discrete_policy.diffusion_loss(replay_data.latents, actor_features)
     latents = discrete_policy.sample(actor_features)
-    q_values = q_to_ascend(policy.critic, critic_features, latents, replay_data.parameters, improvement_q)
+    parameters = replay_data.parameters
+    if improvement_parameters == "policy":
+        with th.no_grad():
+            parameters = policy.actor.sample_parameters(actor_features, policy.actor.codebook.quantize(latents))
+    q_values = q_to_ascend(policy.critic, critic_features, latents, parameters, improvement_q)
     return diffusion_loss, -q_values.mean()
 
 
