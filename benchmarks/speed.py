@@ -26,14 +26,13 @@ from gymnasium import spaces
 from stable_baselines3 import TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
+from tables import README, replace_section
 from torch import nn
 from torch.profiler import ProfilerActivity, profile
 
 import sb3_chdp
 from sb3_chdp import CHDP, FlattenHybridAction, HybridActionSpec
 
-README = Path(__file__).with_name("README.md")
-START, END = "<!-- speed: start -->", "<!-- speed: end -->"
 ENV_ID = "HardMove6-v0"
 # Of the originals with a uniformly random policy: frames per second for Platform (with numba) and Goal, else steps
 REFERENCE_RATES = {
@@ -291,8 +290,7 @@ def main() -> None:
             lines.append(line)
         text += "\n".join([title, *lines, ""])
     if not args.tables:
-        before, rest = README.read_text().split(START)
-        README.write_text(f"{before}{START}\n{text}{END}{rest.split(END)[1]}")
+        replace_section(README, "speed", text.rstrip())
 
 
 if __name__ == "__main__":

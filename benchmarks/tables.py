@@ -25,7 +25,6 @@ from sb3_chdp.envs import ENV_IDS
 
 README = ROOT / "README.md"
 FIGURES = ROOT / "figures"
-START, END = "<!-- tables: start -->", "<!-- tables: end -->"
 LAST_EVALUATIONS = 5
 BOOTSTRAP_REPEATS = 2000
 NAMES = {
@@ -206,6 +205,13 @@ def plot_scores(scores: pd.DataFrame) -> None:
     figure.savefig(FIGURES / "scores.png", dpi=100)
 
 
+def replace_section(path: Path, name: str, text: str) -> None:
+    """Replace what stands between the two markers of a section of a Markdown file."""
+    start, end = (f"<!-- {name}: {place} -->" for place in ("start", "end"))
+    before, rest = path.read_text().split(start)
+    path.write_text(f"{before}{start}\n{text}\n{end}{rest.split(end)[1]}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, default=RESULTS)
@@ -221,9 +227,8 @@ def main() -> None:
     print(text)
     if args.only_print:
         return
-    for path, content in ((README, text), (ROOT.parent / "README.md", overview(scores))):
-        before, rest = path.read_text().split(START)
-        path.write_text(f"{before}{START}\n{content}\n{END}{rest.split(END)[1]}")
+    replace_section(README, "tables", text)
+    replace_section(ROOT.parent / "README.md", "tables", overview(scores))
     FIGURES.mkdir(exist_ok=True)
     plot_curves(runs)
     plot_scores(scores)

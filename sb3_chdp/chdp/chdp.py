@@ -71,6 +71,8 @@ class CHDP(HybridOffPolicyAlgorithm):
     :param improvement_q: which Q the policies ascend: "q1", "min" or "mean" of the two
     :param improvement_parameters: parameters with which the discrete policy's latents are valued, "stored" (the paper)
         or "policy": those that the continuous policy draws for them
+    :param uniform_fraction: share of the batch on which the continuous policy is improved for uniformly random discrete
+        actions rather than those of the discrete policy (0: the paper)
     :param n_action_candidates: number of actions drawn per observation when acting; the one with the highest min(Q1, Q2)
         of the target critics is taken
     :param relabel_latents: whether a stored latent that does not decode to the stored discrete action any more is
@@ -136,6 +138,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         eta: float = 10.0,
         improvement_q: str = "q1",
         improvement_parameters: str = "stored",
+        uniform_fraction: float = 0.0,
         n_action_candidates: int = 16,
         relabel_latents: bool = True,
         codebook_learning_rate: float | Schedule = 1e-4,
@@ -190,6 +193,8 @@ class CHDP(HybridOffPolicyAlgorithm):
             raise ValueError(
                 f"improvement_parameters must be one of {IMPROVEMENT_PARAMETERS}, got {improvement_parameters!r}"
             )
+        if not 0 <= uniform_fraction <= 1:
+            raise ValueError(f"uniform_fraction must be between 0 and 1, got {uniform_fraction}")
         for name, value in (
             ("latent_dim", latent_dim),
             ("n_action_candidates", n_action_candidates),
@@ -204,6 +209,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         self.eta = eta
         self.improvement_q = improvement_q
         self.improvement_parameters = improvement_parameters
+        self.uniform_fraction = uniform_fraction
         self.n_action_candidates = n_action_candidates
         self.relabel_latents = relabel_latents
         self.codebook_learning_rate = codebook_learning_rate
@@ -285,7 +291,7 @@ class CHDP(HybridOffPolicyAlgorithm):
 
                 # Step 2: continuous policy and codebook, given the updated discrete policy
                 diffusion_loss, q_loss, k = continuous_policy_loss(
-                    policy, replay_data, *features, self.improvement_q, self.sequential_update
+                    policy, replay_data, *features, self.improvement_q, self.sequential_update, self.uniform_fraction
                 )
                 loss = diffusion_loss + alpha * q_loss
                 self._optimize(loss, policy.continuous_optimizer, policy.codebook_optimizer)

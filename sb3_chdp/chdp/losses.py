@@ -90,6 +90,7 @@ def continuous_policy_loss(
     critic_features: th.Tensor,
     improvement_q: str,
     sequential_update: bool,
+    uniform_fraction: float,
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """
     Eq. continuous_policy_loss_chdp_final: Q of parameters drawn through the whole chain, given latents of the updated
@@ -101,6 +102,7 @@ def continuous_policy_loss(
     :param critic_features: (B, features_dim) features of the critics
     :param improvement_q: one of ``IMPROVEMENT_QS``
     :param sequential_update: False takes the stored latents and actions instead
+    :param uniform_fraction: share of the batch that takes uniformly random actions and their codewords instead
     :return: diffusion loss, policy improvement loss, and the (B,) discrete actions
     """
     actor = policy.actor
@@ -116,6 +118,11 @@ def continuous_policy_loss(
             k = actor.codebook.quantize(latents)
     else:
         latents, k = replay_data.latents, stored_k
+    n_uniform = round(uniform_fraction * len(k))
+    if n_uniform > 0:
+        uniform_k = th.randint(actor.codebook.n_discrete_actions, (n_uniform,), device=k.device)
+        k = th.cat([uniform_k, k[n_uniform:]])
+        latents = th.cat([actor.codebook.representative_latents(uniform_k), latents[n_uniform:]])
     parameters = actor.sample_parameters(actor_features, k)
     q_values = q_to_ascend(policy.critic, critic_features, latents, parameters, improvement_q)
     return diffusion_loss, -q_values.mean(), k

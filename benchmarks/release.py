@@ -1,0 +1,93 @@
+"""
+The published models and the pictures of them, from the runs that reproduce.py has left on this machine.
+
+    python benchmarks/release.py                      for every environment CHDP's best seed, and HyAR-TD3 on Hard Move 6
+    sb3-chdp enjoy --env Goal-v0 -f benchmarks/models      watch one
+
+A published model is a full zip of its algorithm, made small: the online networks of CHDP are replaced by their targets, by
+which deterministic actions are chosen, and optimizers start anew. It predicts as the trained model does and can be trained on.
+"""
+
+import argparse
+import zipfile
+from pathlib import Path
+
+import gymnasium as gym
+import torch as th
+from cells import ALGORITHMS, RESULTS, ROOT
+from PIL import Image
+from stable_baselines3.common.base_class import BaseAlgorithm
+from tables import read_runs, scores_of
+
+from sb3_chdp import CHDP
+from sb3_chdp.envs import ENV_IDS
+
+PUBLISHED = [("chdp", env_id) for env_id in ENV_IDS] + [("hyar_td3", "HardMove6-v0")]
+GIFS = ROOT.parent / "docs" / "images"
+GIF_WIDTH, MAX_FRAMES, EPISODES = 240, 150, 4
+
+
+def shrink(model: BaseAlgorithm) -> None:
+    """Drop what a deterministic prediction does not need; see above."""
+    if isinstance(model, CHDP):
+        model.actor.load_state_dict(model.actor_target.state_dict())
+        model.critic.load_state_dict(model.critic_target.state_dict())
+    for name in model._get_torch_save_params()[0]:
+        owner: object = model
+        for part in name.split("."):
+            owner = getattr(owner, part)
+        if isinstance(owner, th.optim.Optimizer):
+            owner.state.clear()
+
+
+def save_compressed(model: BaseAlgorithm, path: Path) -> None:
+    """Save as SB3 does, then compress: LZMA finds that targets equal online networks."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    model.save(path)
+    with zipfile.ZipFile(path) as archive:
+        contents = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
+        for name, content in contents.items():
+            archive.writestr(name, content)
+
+
+def record_gif(model: BaseAlgorithm, env_id: str, path: Path) -> None:
+    """A GIF of a few episodes of deterministic actions."""
+    env = gym.make(env_id, render_mode="rgb_array")
+    frames: list[Image.Image] = []
+    for episode in range(EPISODES):
+        obs, _ = env.reset(seed=episode)
+        over = False
+        while not over and len(frames) < MAX_FRAMES:
+            action, _ = model.predict(obs, deterministic=True)
+            obs, _, terminated, truncated, _ = env.step(action)
+            over = terminated or truncated
+            frame = Image.fromarray(env.render())
+            frames.append(frame.resize((GIF_WIDTH, GIF_WIDTH * frame.height // frame.width)).quantize(32))
+    env.close()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=100, loop=0, optimize=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--results", type=Path, default=RESULTS / "main")
+    args = parser.parse_args()
+    scores = scores_of(read_runs(args.results))
+    for algo, env_id in PUBLISHED:
+        runs = scores[(scores["row"] == algo) & (scores["env"] == env_id)]
+        zips = [args.results / algo / env_id / f"seed_{seed}.zip" for seed in runs.sort_values("success")["seed"]]
+        if not zips or not zips[-1].exists():
+            print(f"{algo} {env_id}: no trained model in {args.results}")
+            continue
+        model = ALGORITHMS[algo].load(zips[-1], device="cpu")
+        shrink(model)
+        path = ROOT / "models" / algo / f"{env_id}_1" / f"{env_id}.zip"
+        save_compressed(model, path)
+        if algo == "chdp":
+            record_gif(model, env_id, GIFS / f"{env_id}.gif")
+        print(f"{algo} {env_id}: {zips[-1].stem}, {path.stat().st_size / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    main()
