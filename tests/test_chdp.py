@@ -54,14 +54,17 @@ def batch_of(model, size=32):
 
 def actions_of_continuous_loss(model, data):
     features = model.policy.actor_features(data.observations)
-    return losses.continuous_policy_loss(model.policy, data, features, features, "q1", model.sequential_update)[2]
+    options = model.improvement_q, model.sequential_update, model.uniform_fraction
+    return losses.continuous_policy_loss(model.policy, data, features, features, *options)[2]
 
 
 def all_losses(model):
     data, policy, q = batch_of(model), model.policy, model.improvement_q
     features = (policy.actor_features(data.observations), model.critic.features(data.observations).detach())
-    discrete = losses.discrete_policy_loss(policy, data, *features, q)
-    continuous = losses.continuous_policy_loss(policy, data, *features, q, model.sequential_update)
+    discrete = losses.discrete_policy_loss(policy, data, *features, q, model.improvement_parameters)
+    continuous = losses.continuous_policy_loss(
+        policy, data, *features, q, model.sequential_update, model.uniform_fraction
+    )
     return {
         "critic": losses.critic_loss(policy, data)[0],
         "discrete diffusion": discrete[0],
@@ -82,9 +85,10 @@ GRADIENTS = {
 }
 
 
+@pytest.mark.parametrize("improvement_parameters", losses.IMPROVEMENT_PARAMETERS)
 @pytest.mark.parametrize("loss", GRADIENTS)
-def test_gradient_routing(loss):
-    model = filled_model()
+def test_gradient_routing(loss, improvement_parameters):
+    model = filled_model(improvement_parameters=improvement_parameters)
     assert networks_with_gradient(model, all_losses(model)[loss]) == GRADIENTS[loss]
 
 
@@ -138,6 +142,30 @@ def test_without_sequential_update_the_stored_actions_are_used():
     model = filled_model(sequential_update=False)
     data = batch_of(model)
     assert (actions_of_continuous_loss(model, data) == data.discrete_actions).all()
+
+
+def test_uniform_fraction():
+    """Part of the batch takes uniformly random actions, the rest those of the discrete policy."""
+    model = filled_model(uniform_fraction=0.25)
+    force_action(model, 2)
+    k = actions_of_continuous_loss(model, batch_of(model, 400))
+    assert (k[100:] == 2).all()
+    assert th.bincount(k[:100], minlength=3).min() > 15
+
+
+@pytest.mark.parametrize("improvement_parameters", losses.IMPROVEMENT_PARAMETERS)
+def test_parameters_with_which_latents_are_valued(improvement_parameters):
+    model = filled_model(improvement_parameters=improvement_parameters)
+    force_action(model, 1)
+    # Parameters of 0.5 for action 1, -0.5 for the others
+    model.actor.sample_parameters = lambda features, k: (k[:, None] == 1).float() - 0.5
+    data, features = batch_of(model), model.policy.actor_features
+    seen = []
+    model.critic.q_networks[0].register_forward_pre_hook(lambda module, args: seen.append(args[0]))
+    obs = features(data.observations)
+    losses.discrete_policy_loss(model.policy, data, obs, obs, "q1", improvement_parameters)
+    expected = data.parameters if improvement_parameters == "stored" else th.full_like(data.parameters, 0.5)
+    assert th.equal(seen[0][:, -1:], expected)
 
 
 def force_action(model, k):
@@ -346,7 +374,7 @@ def test_random_rows_decode_to_their_action(k_total):
     "kwargs", [dict(diffusion=False), dict(codebook=False), dict(sequential_update=False),
                dict(codebook=False, sequential_update=False), dict(improvement_q="min"), dict(improvement_q="mean"),
                dict(variance_type="fixed_small", beta_schedule="cosine"), dict(n_action_candidates=1),
-               dict(max_grad_norm=None), dict(codebook_learning_rate=1e-4), dict(n_diffusion_steps=1)],
+               dict(improvement_parameters="policy", uniform_fraction=0.5), dict(max_grad_norm=None), dict(codebook_learning_rate=1e-4), dict(n_diffusion_steps=1)],
     ids=str,
 )  # fmt: skip
 def test_ablations_and_options_run(kwargs, tmp_path):

@@ -233,7 +233,8 @@ def test_unbounded_parameters(algorithm):
 
 @pytest.mark.parametrize(
     "kwargs, name",
-    [(dict(improvement_q="max"), "improvement_q"), (dict(beta_schedule="x"), "beta_schedule"),
+    [(dict(improvement_q="max"), "improvement_q"), (dict(improvement_parameters="x"), "improvement_parameters"),
+     (dict(uniform_fraction=1.5), "uniform_fraction"), (dict(beta_schedule="x"), "beta_schedule"),
      (dict(n_diffusion_steps=0), "n_diffusion_steps"), (dict(latent_dim=0), "latent_dim")],
 )  # fmt: skip
 def test_bad_arguments_of_chdp(kwargs, name):
