@@ -341,23 +341,30 @@ def test_noise_of_deterministic_predictions_depends_on_the_observation():
     assert (hash_observations(vectors + 1e-6) != hash_observations(vectors)).float().mean() > 0.99
 
 
-def test_the_best_candidate_acts():
-    model = filled_model(n_action_candidates=8)
+@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize("uniform_fraction", [0.0, 0.5])
+def test_the_best_candidate_acts(uniform_fraction, deterministic):
+    model = filled_model(n_action_candidates=8, uniform_fraction=uniform_fraction)
     obs = np.random.uniform(-1, 1, (6, 4)).astype(np.float32)
     candidates = {}
-    original = model.actor.sample
+    actor = model.actor_target if deterministic else model.actor
+    original = actor.sample_parameters
 
-    def spy(features, noise=(None, None)):
-        candidates["latents"], candidates["k"], candidates["parameters"] = original(features, noise)
-        return tuple(candidates.values())
+    def spy(features, k, noise):
+        candidates["k"], candidates["parameters"] = k, original(features, k, noise)
+        return candidates["parameters"]
 
-    model.actor.sample = spy
-    rows = model.policy.predict_rows(obs)
-    features = th.as_tensor(obs).repeat_interleave(8, dim=0)
-    with th.no_grad():
-        q = th.min(*model.critic_target.q_values(features, candidates["latents"], candidates["parameters"])).view(6, 8)
-    best = q.argmax(dim=1)
-    np.testing.assert_allclose(rows[:, 1:2], candidates["parameters"].view(6, 8)[th.arange(6), best][:, None])
+    actor.sample_parameters = spy
+    q_values, q_networks = [], model.critic_target.q_values
+    model.critic_target.q_values = lambda *args: q_values.append(q_networks(*args)) or q_values[-1]
+    rows = model.policy.predict_rows(obs, deterministic)
+    best = th.min(*q_values[0]).view(6, 8).argmax(dim=1)
+    for column, name in ((0, "k"), (1, "parameters")):
+        np.testing.assert_allclose(rows[:, column], candidates[name].view(6, 8)[th.arange(6), best])
+    assert (model.actor.codebook.quantize(th.as_tensor(rows[:, 2:])).numpy() == rows[:, 0]).all()
+    # Four uniform candidates cover three actions
+    covered = candidates["k"].view(6, 8)[:, :4].sort(dim=1).values.diff(dim=1).count_nonzero(dim=1)
+    assert uniform_fraction == 0 or (covered == 2).all()
 
 
 @pytest.mark.parametrize("k_total", [2, 1000])

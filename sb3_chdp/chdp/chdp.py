@@ -71,8 +71,8 @@ class CHDP(HybridOffPolicyAlgorithm):
     :param improvement_q: which Q the policies ascend: "q1", "min" or "mean" of the two
     :param improvement_parameters: parameters with which the discrete policy's latents are valued, "stored" (the paper)
         or "policy": those that the continuous policy draws for them
-    :param uniform_fraction: share of the batch on which the continuous policy is improved for uniformly random discrete
-        actions rather than those of the discrete policy (0: the paper)
+    :param uniform_fraction: share of uniformly random discrete actions among those that the continuous policy is improved
+        for, and among the candidates (0: the paper)
     :param n_action_candidates: number of actions drawn per observation when acting; the one with the highest min(Q1, Q2)
         of the target critics is taken
     :param relabel_latents: whether a stored latent that does not decode to the stored discrete action any more is
@@ -231,6 +231,7 @@ class CHDP(HybridOffPolicyAlgorithm):
             beta_schedule=self.beta_schedule,
             variance_type=self.variance_type,
             n_action_candidates=self.n_action_candidates,
+            uniform_fraction=self.uniform_fraction,
             exploration_noise=self.exploration_noise,
         )
 

@@ -114,8 +114,7 @@ def continuous_policy_loss(
 
     if sequential_update:
         with th.no_grad():
-            latents = actor.discrete_policy.sample(actor_features)
-            k = actor.codebook.quantize(latents)
+            latents, k = actor.sample_latents(actor_features)
     else:
         latents, k = replay_data.latents, stored_k
     n_uniform = round(uniform_fraction * len(k))

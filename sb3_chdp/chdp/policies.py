@@ -78,6 +78,15 @@ class CooperativeActor(BaseModel):
         """:return: (B, Pmax) 1 for the parameters that action k has, None if no action has padding"""
         return self.parameter_mask[k] if self._has_padding else None
 
+    def sample_latents(self, features: th.Tensor, noise: th.Tensor | None = None) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param features: (B, features_dim)
+        :param noise: noise of the discrete policy's chain, drawn if None
+        :return: latents (B, latent_dim) and the discrete actions (B,) that they decode to
+        """
+        latents = self.discrete_policy.sample(features, noise)
+        return latents, self.codebook.quantize(latents)
+
     def sample_parameters(self, features: th.Tensor, k: th.Tensor, noise: th.Tensor | None = None) -> th.Tensor:
         """
         :param features: (B, features_dim)
@@ -96,8 +105,7 @@ class CooperativeActor(BaseModel):
         :param noise: noise of the two chains, drawn if None
         :return: latents (B, latent_dim), discrete actions (B,), parameters (B, Pmax)
         """
-        latents = self.discrete_policy.sample(features, noise[0])
-        k = self.codebook.quantize(latents)
+        latents, k = self.sample_latents(features, noise[0])
         return latents, k, self.sample_parameters(features, k, noise[1])
 
 
@@ -127,6 +135,7 @@ class CHDPPolicy(HybridPolicy):
     :param variance_type: see :class:`NoiseSchedule`
     :param n_action_candidates: number of actions drawn per observation, of which the one with the highest min(Q1, Q2) of
         the target critics acts
+    :param uniform_fraction: share of these candidates whose discrete action is uniformly random
     :param exploration_noise: standard deviation of the exploration noise of policies without diffusion
     """
 
@@ -152,6 +161,7 @@ class CHDPPolicy(HybridPolicy):
         beta_schedule: str = "vp",
         variance_type: str = "fixed_large",
         n_action_candidates: int = 16,
+        uniform_fraction: float = 0.0,
         exploration_noise: float = 0.1,
     ):
         if optimizer_kwargs is None:
@@ -176,6 +186,7 @@ class CHDPPolicy(HybridPolicy):
         self.beta_schedule = beta_schedule
         self.variance_type = variance_type
         self.n_action_candidates = n_action_candidates
+        self.uniform_fraction = uniform_fraction
         self.exploration_noise = exploration_noise
         self._build(lr_schedule)
 
@@ -267,11 +278,21 @@ class CHDPPolicy(HybridPolicy):
         batch_size = features.shape[0]
         noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None)
         if deterministic:
-            chains = hash_observations(observation)[:, None] + th.arange(n_candidates, device=features.device)
-            chains = chains.flatten() % FIXED_NOISE_CHAINS
+            hashes = hash_observations(observation)
+            chains = (hashes[:, None] + th.arange(n_candidates, device=features.device)).flatten() % FIXED_NOISE_CHAINS
             noise = (self.fixed_latent_noise[..., chains, :], self.fixed_parameter_noise[..., chains, :])
+        else:
+            hashes = th.randint(2**31, (batch_size,), device=features.device)
         features = features.repeat_interleave(n_candidates, dim=0)
-        latents, k, parameters = actor.sample(features, noise)
+        latents, k = actor.sample_latents(features, noise[0])
+        n_uniform = int(self.uniform_fraction * n_candidates)
+        if n_uniform > 0:
+            # Successive actions: all of them if there are no more than candidates
+            k_total = actor.codebook.n_discrete_actions
+            k.view(batch_size, -1)[:, :n_uniform] = (hashes[:, None] + th.arange(n_uniform, device=k.device)) % k_total
+            uniform = th.arange(len(k), device=k.device) % n_candidates < n_uniform
+            latents[uniform] = actor.codebook.representative_latents(k[uniform])
+        parameters = actor.sample_parameters(features, k, noise[1])
         rows = th.cat([k[:, None].float(), parameters, latents], dim=1)
         if n_candidates == 1:
             return rows
@@ -328,6 +349,7 @@ class CHDPPolicy(HybridPolicy):
                 beta_schedule=self.beta_schedule,
                 variance_type=self.variance_type,
                 n_action_candidates=self.n_action_candidates,
+                uniform_fraction=self.uniform_fraction,
                 exploration_noise=self.exploration_noise,
                 lr_schedule=self._dummy_schedule,  # dummy lr schedule, not needed for loading policy alone
             )
