@@ -4,7 +4,7 @@ What the policies of Hard Move 6 have learnt: the paper's expressiveness experim
     python benchmarks/reproduce.py expressivity
 
 The published models draw 100 actions at one state: the agent at rest, the target so close above it that many subsets of the
-actuators reach it in one step. Rewrites its section of benchmarks/README.md, figures/expressivity.png and figures/codebook.png.
+actuators reach it in one step. Rewrites its section of benchmarks/README.md, and expressivity.png and codebook.png in figures.
 """
 
 import gymnasium as gym
@@ -55,7 +55,8 @@ def markdown(draws: dict[str, pd.DataFrame]) -> str:
         groups = actions.assign(x=directions[:, 0], y=directions[:, 1]).groupby(["x", "y"])
         for (x, y), group in sorted(groups, key=lambda item: -len(item[1])):
             strength = f"{group['s'].mean():.3f} ± {group['s'].std(ddof=0):.3f}"
-            lines.append(f"| {name} | ({x:.3f}, {y:.3f}) | {len(group)} % | {strength} | {100 * group['reached'].mean():.0f} % |")
+            reached = f"{100 * group['reached'].mean():.0f} %"
+            lines.append(f"| {name} | ({x:.3f}, {y:.3f}) | {len(group)} % | {strength} | {reached} |")
     return "\n".join(lines)
 
 

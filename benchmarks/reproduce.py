@@ -4,7 +4,7 @@ The paper's tables, with our own numbers (also ``sb3-chdp benchmark``).
     python benchmarks/reproduce.py main --jobs 2                         6 algorithms x 8 environments x 3 seeds
     python benchmarks/reproduce.py main --algos chdp --envs HardMove6-v0 --seeds 10 11 12
     python benchmarks/reproduce.py ablation --jobs 2                     5 variants of CHDP x 2 environments
-    python benchmarks/reproduce.py expressivity                          100 actions of the published models, see expressivity.py
+    python benchmarks/reproduce.py expressivity                          actions of the published models: expressivity.py
 
 Every cell appends its evaluations to results/<table>/<row>/<environment>/seed_<k>.csv and leaves its settings, versions and
 commit beside it when it is done. Finished cells are skipped, interrupted ones go on from their last checkpoint (with fresh

@@ -62,9 +62,7 @@ def all_losses(model):
     data, policy, q = batch_of(model), model.policy, model.improvement_q
     features = (policy.actor_features(data.observations), model.critic.features(data.observations).detach())
     discrete = losses.discrete_policy_loss(policy, data, *features, q, model.improvement_parameters)
-    continuous = losses.continuous_policy_loss(
-        policy, data, *features, q, model.sequential_update, model.uniform_fraction
-    )
+    continuous = losses.continuous_policy_loss(policy, data, *features, q, model.sequential_update, model.uniform_fraction)
     return {
         "critic": losses.critic_loss(policy, data)[0],
         "discrete diffusion": discrete[0],
@@ -381,7 +379,8 @@ def test_random_rows_decode_to_their_action(k_total):
     "kwargs", [dict(diffusion=False), dict(codebook=False), dict(sequential_update=False),
                dict(codebook=False, sequential_update=False), dict(improvement_q="min"), dict(improvement_q="mean"),
                dict(variance_type="fixed_small", beta_schedule="cosine"), dict(n_action_candidates=1),
-               dict(improvement_parameters="policy", uniform_fraction=0.5), dict(max_grad_norm=None), dict(codebook_learning_rate=1e-4), dict(n_diffusion_steps=1)],
+               dict(improvement_parameters="policy", uniform_fraction=0.5), dict(max_grad_norm=None),
+               dict(codebook_learning_rate=1e-4), dict(n_diffusion_steps=1)],
     ids=str,
 )  # fmt: skip
 def test_ablations_and_options_run(kwargs, tmp_path):

@@ -190,9 +190,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         if improvement_q not in IMPROVEMENT_QS:
             raise ValueError(f"improvement_q must be one of {IMPROVEMENT_QS}, got {improvement_q!r}")
         if improvement_parameters not in IMPROVEMENT_PARAMETERS:
-            raise ValueError(
-                f"improvement_parameters must be one of {IMPROVEMENT_PARAMETERS}, got {improvement_parameters!r}"
-            )
+            raise ValueError(f"improvement_parameters must be one of {IMPROVEMENT_PARAMETERS}, got {improvement_parameters!r}")
         if not 0 <= uniform_fraction <= 1:
             raise ValueError(f"uniform_fraction must be between 0 and 1, got {uniform_fraction}")
         for name, value in (
