@@ -26,8 +26,14 @@ from rich.table import Table
 
 from sb3_chdp.envs import ENV_IDS
 
-# Row of the ablation table: arguments of CHDP; all with the paper's default parameters
-PAPER_DEFAULTS = {"n_diffusion_steps": 15, "eta": 10.0, "latent_dim": 8}
+# Row of the ablation table: arguments of CHDP; all with the paper's default parameters and policy losses
+PAPER_DEFAULTS = {
+    "n_diffusion_steps": 15,
+    "eta": 10.0,
+    "latent_dim": 8,
+    "improvement_parameters": "stored",
+    "uniform_fraction": 0.0,
+}
 ABLATION = {
     "full": {},
     "without_diffusion": {"diffusion": False},

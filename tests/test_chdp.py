@@ -117,7 +117,7 @@ def test_each_step_moves_its_own_networks_only():
 
 def test_continuous_step_sees_the_updated_discrete_policy(monkeypatch):
     """The latents of step 2 are those that the discrete policy draws after its own step."""
-    model = filled_model()
+    model = filled_model(uniform_fraction=0)
     seen = []
     original = losses.continuous_policy_loss
 
@@ -137,7 +137,7 @@ def test_continuous_step_sees_the_updated_discrete_policy(monkeypatch):
 
 
 def test_without_sequential_update_the_stored_actions_are_used():
-    model = filled_model(sequential_update=False)
+    model = filled_model(sequential_update=False, uniform_fraction=0)
     data = batch_of(model)
     assert (actions_of_continuous_loss(model, data) == data.discrete_actions).all()
 

@@ -40,9 +40,13 @@ class CHDP(HybridOffPolicyAlgorithm):
     Differences from the paper:
         1. the action of highest Q among ``n_action_candidates`` draws acts (1: the paper);
         2. uniformly random actions with a decreasing probability, see ``exploration_initial_eps`` (0: the paper);
-        3. latents from the buffer that no longer decode to the action taken are replaced, see ``relabel_latents``;
-        4. gradient norms are clipped, see ``max_grad_norm``;
-        5. codewords are kept in [-1, 1], where the latents are (not an argument: without it they drift away, and latents
+        3. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
+           stored ones, see ``improvement_parameters`` ("stored": the paper);
+        4. the continuous policy is improved for uniformly random discrete actions too, some of which are among the
+           candidates, see ``uniform_fraction`` (0: the paper);
+        5. latents from the buffer that no longer decode to the action taken are replaced, see ``relabel_latents``;
+        6. gradient norms are clipped, see ``max_grad_norm``;
+        7. codewords are kept in [-1, 1], where the latents are (not an argument: without it they drift away, and latents
            can no longer reach them).
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
@@ -69,10 +73,10 @@ class CHDP(HybridOffPolicyAlgorithm):
     :param variance_type: variance of a denoising step, "fixed_large" (the paper) or "fixed_small" (DDPM's posterior)
     :param eta: weight of the policy improvement terms relative to the diffusion losses
     :param improvement_q: which Q the policies ascend: "q1", "min" or "mean" of the two
-    :param improvement_parameters: parameters with which the discrete policy's latents are valued, "stored" (the paper)
-        or "policy": those that the continuous policy draws for them
+    :param improvement_parameters: parameters with which the discrete policy's latents are valued: "stored", those of the
+        action once taken, or "policy", those that the continuous policy draws for the latents
     :param uniform_fraction: share of uniformly random discrete actions among those that the continuous policy is improved
-        for, and among the candidates (0: the paper)
+        for, and among the candidates
     :param n_action_candidates: number of actions drawn per observation when acting; the one with the highest min(Q1, Q2)
         of the target critics is taken
     :param relabel_latents: whether a stored latent that does not decode to the stored discrete action any more is
@@ -137,8 +141,8 @@ class CHDP(HybridOffPolicyAlgorithm):
         variance_type: str = "fixed_large",
         eta: float = 10.0,
         improvement_q: str = "q1",
-        improvement_parameters: str = "stored",
-        uniform_fraction: float = 0.0,
+        improvement_parameters: str = "policy",
+        uniform_fraction: float = 0.25,
         n_action_candidates: int = 16,
         relabel_latents: bool = True,
         codebook_learning_rate: float | Schedule = 1e-4,

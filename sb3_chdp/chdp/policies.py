@@ -161,7 +161,7 @@ class CHDPPolicy(HybridPolicy):
         beta_schedule: str = "vp",
         variance_type: str = "fixed_large",
         n_action_candidates: int = 16,
-        uniform_fraction: float = 0.0,
+        uniform_fraction: float = 0.25,
         exploration_noise: float = 0.1,
     ):
         if optimizer_kwargs is None:
