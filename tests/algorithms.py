@@ -1,7 +1,7 @@
 """The algorithms that the shared tests run on, with small settings."""
 
 from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3, PDQNTD3, HyARTD3
-from tests.hybrid_envs import layouts
+from tests.hybrid_envs import HybridIdentityEnv, layouts
 
 OFF_POLICY = dict(batch_size=8, learning_starts=12, buffer_size=500)
 SMALL = {
@@ -19,3 +19,17 @@ LAYOUTS = list(layouts())
 
 def make_model(algorithm, env, policy="MlpPolicy", **kwargs):
     return algorithm(policy, env, **{"policy_kwargs": dict(net_arch=[8, 8]), "seed": 0, **SMALL[algorithm], **kwargs})
+
+
+FAST_CHDP = dict(
+    n_diffusion_steps=3, latent_dim=4, batch_size=16, learning_starts=20, n_action_candidates=2, buffer_size=1000,
+    policy_kwargs=dict(net_arch=[16, 16]), seed=0,
+)  # fmt: skip
+
+
+def filled_model(env=None, **kwargs):
+    """A CHDP model with 60 random transitions that has not been trained."""
+    model = CHDP("MlpPolicy", env or HybridIdentityEnv(), **{**FAST_CHDP, **kwargs})
+    model.learning_starts = 10**9
+    model.learn(60)
+    return model
