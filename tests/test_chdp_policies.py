@@ -56,8 +56,8 @@ def test_action_noise_spares_padding_and_is_clipped():
     from stable_baselines3.common.noise import NormalActionNoise
 
     noise = NormalActionNoise(np.zeros(2), 10 * np.ones(2))
-    model = CHDP("MlpPolicy", make_layout_env("nested"), **{**FAST_CHDP, "exploration_initial_eps": 0, "exploration_final_eps": 0},
-                 action_noise=noise)  # fmt: skip
+    kwargs = {**FAST_CHDP, "exploration_initial_eps": 0, "exploration_final_eps": 0}
+    model = CHDP("MlpPolicy", make_layout_env("nested"), action_noise=noise, **kwargs)
     model.learn(60)
     data = model._sample_batch(64)
     mask = th.as_tensor(model.hybrid_space.spec.mask[data.discrete_actions])
