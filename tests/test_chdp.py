@@ -48,7 +48,7 @@ def all_losses(model):
     discrete = losses.discrete_policy_loss(policy, data, *features, q, model.improvement_parameters)
     continuous = losses.continuous_policy_loss(policy, data, *features, q, model.sequential_update, model.uniform_fraction)
     return {
-        "critic": losses.critic_loss(policy, data)[0],
+        "critic": losses.critic_loss(policy, data, model.n_target_candidates)[0],
         "discrete diffusion": discrete[0],
         "discrete improvement": discrete[1],
         "continuous diffusion": continuous[0],
@@ -170,10 +170,10 @@ def test_critic_target():
         y = data.rewards + 0.9 * (1 - data.dones) * th.min(q1, q2)
         ours = model.critic.q_values(data.observations, data.latents, data.parameters)
         expected = sum(F.mse_loss(q, y) for q in ours)
-    loss, q_values = losses.critic_loss(model.policy, data)
+    loss, q_values = losses.critic_loss(model.policy, data, 1)
     th.testing.assert_close(loss.detach(), expected)
     th.testing.assert_close(q_values, ours[0])
-    shorter = losses.critic_loss(model.policy, data._replace(discounts=th.full((32, 1), 0.1)))[0]
+    shorter = losses.critic_loss(model.policy, data._replace(discounts=th.full((32, 1), 0.1)), 1)[0]
     assert not th.isclose(shorter, loss)
 
 

@@ -79,6 +79,8 @@ class CHDP(HybridOffPolicyAlgorithm):
         for, and among the candidates
     :param n_action_candidates: number of actions drawn per observation when acting; the one with the highest min(Q1, Q2)
         of the target critics is taken
+    :param n_target_candidates: number of next actions drawn per transition for the target of the critics, chosen from in
+        the same way (1: the paper)
     :param relabel_latents: whether a stored latent that does not decode to the stored discrete action any more is
         replaced by that action's present codeword
     :param codebook_learning_rate: learning rate of the codebook; the faster it moves, the more stored latents
@@ -144,6 +146,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         improvement_parameters: str = "policy",
         uniform_fraction: float = 0.25,
         n_action_candidates: int = 16,
+        n_target_candidates: int = 1,
         relabel_latents: bool = True,
         codebook_learning_rate: float | Schedule = 1e-4,
         max_grad_norm: float | None = 1.0,
@@ -200,6 +203,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         for name, value in (
             ("latent_dim", latent_dim),
             ("n_action_candidates", n_action_candidates),
+            ("n_target_candidates", n_target_candidates),
             ("policy_delay", policy_delay),
         ):
             if value < 1:
@@ -213,6 +217,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         self.improvement_parameters = improvement_parameters
         self.uniform_fraction = uniform_fraction
         self.n_action_candidates = n_action_candidates
+        self.n_target_candidates = n_target_candidates
         self.relabel_latents = relabel_latents
         self.codebook_learning_rate = codebook_learning_rate
         self.max_grad_norm = max_grad_norm
@@ -272,7 +277,7 @@ class CHDP(HybridOffPolicyAlgorithm):
             replay_data, drift = relabel_latents(policy, self._sample_batch(batch_size), self.relabel_latents)
 
             # Step 0: critics
-            loss, q_values = critic_loss(policy, replay_data)
+            loss, q_values = critic_loss(policy, replay_data, self.n_target_candidates)
             self._optimize(loss, policy.critic.optimizer)
             losses = {"critic_loss": loss, "q_mean": q_values.mean(), "latent_drift": drift}
 

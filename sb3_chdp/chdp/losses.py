@@ -30,22 +30,21 @@ def relabel_latents(
     return replay_data, drifted.float().mean()
 
 
-def critic_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> tuple[th.Tensor, th.Tensor]:
+def critic_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, n_target_candidates: int) -> tuple[th.Tensor, th.Tensor]:
     """
     Mean squared Bellman errors (eq. CHDP_critic_loss_overview).
 
     :param policy: the networks
     :param replay_data: a batch
+    :param n_target_candidates: number of next actions drawn per transition, of which the best counts
     :return: their sum over both critics, and the detached (B, 1) values of the first
     """
     critic, critic_target, actor_target = policy.critic, policy.critic_target, policy.actor_target
     with th.no_grad():
-        # Next action of the target policies
+        # Next action of the target policies, and min over both target critics
         next_features = actor_target.features(replay_data.next_observations)
-        next_latents, _, next_parameters = actor_target.sample(next_features)
-        # Compute the next Q-values: min over both target critics
         next_critic_features = critic_target.features(replay_data.next_observations)
-        next_q_values = th.min(*critic_target.q_values(next_critic_features, next_latents, next_parameters))
+        *_, next_q_values = policy.best_candidate(actor_target, next_features, next_critic_features, n_target_candidates)
         target_q_values = replay_data.rewards + (1 - replay_data.dones) * replay_data.discounts * next_q_values
     features = critic.features(replay_data.observations)
     q1, q2 = critic.q_values(features, replay_data.latents, replay_data.parameters)

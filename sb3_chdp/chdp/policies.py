@@ -262,6 +262,49 @@ class CHDPPolicy(HybridPolicy):
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(obs, deterministic)
 
+    def best_candidate(
+        self,
+        actor: CooperativeActor,
+        features: th.Tensor,
+        critic_features: th.Tensor,
+        n_candidates: int,
+        hashes: th.Tensor | None = None,
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
+        """
+        Draw actions and keep the one of highest min(Q1, Q2) of the target critics.
+
+        :param actor: the policies
+        :param features: (B, features_dim) features for the policies
+        :param critic_features: (B, features_dim) features for the target critics
+        :param n_candidates: number of actions drawn per row, a share ``uniform_fraction`` of them with random k
+        :param hashes: (B,) numbers that decide the noise of the row; random noise if None
+        :return: latents (B, latent_dim), discrete actions (B,), parameters (B, Pmax) and their min(Q1, Q2) (B, 1)
+        """
+        batch_size, device = features.shape[0], features.device
+        noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None)
+        if hashes is not None:
+            chains = (hashes[:, None] + th.arange(n_candidates, device=device)).flatten() % FIXED_NOISE_CHAINS
+            noise = (self.fixed_latent_noise[..., chains, :], self.fixed_parameter_noise[..., chains, :])
+        if n_candidates > 1:
+            features = features.repeat_interleave(n_candidates, dim=0)
+            critic_features = critic_features.repeat_interleave(n_candidates, dim=0)
+        latents, k = actor.sample_latents(features, noise[0])
+        n_uniform = int(self.uniform_fraction * n_candidates)
+        if n_uniform > 0:
+            if hashes is None:
+                hashes = th.randint(2**31, (batch_size,), device=device)
+            # Successive actions: all of them if there are no more than candidates
+            k_total = actor.codebook.n_discrete_actions
+            k.view(batch_size, -1)[:, :n_uniform] = (hashes[:, None] + th.arange(n_uniform, device=device)) % k_total
+            uniform = th.arange(len(k), device=device) % n_candidates < n_uniform
+            latents[uniform] = actor.codebook.representative_latents(k[uniform])
+        parameters = actor.sample_parameters(features, k, noise[1])
+        q_values = th.min(*self.critic_target.q_values(critic_features, latents, parameters))
+        if n_candidates == 1:
+            return latents, k, parameters, q_values
+        best = q_values.view(batch_size, n_candidates).argmax(dim=1) + th.arange(batch_size, device=device) * n_candidates
+        return latents[best], k[best], parameters[best], q_values[best]
+
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """
         Draw ``n_action_candidates`` actions per observation and keep the one of highest target min(Q1, Q2).
@@ -272,34 +315,11 @@ class CHDPPolicy(HybridPolicy):
 
         :return: (B, 1 + Pmax + latent_dim) rows
         """
-        n_candidates = self.n_action_candidates
         actor = self.actor_target if deterministic else self.actor
-        features = actor.features(observation)
-        batch_size = features.shape[0]
-        noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None)
-        if deterministic:
-            hashes = hash_observations(observation)
-            chains = (hashes[:, None] + th.arange(n_candidates, device=features.device)).flatten() % FIXED_NOISE_CHAINS
-            noise = (self.fixed_latent_noise[..., chains, :], self.fixed_parameter_noise[..., chains, :])
-        else:
-            hashes = th.randint(2**31, (batch_size,), device=features.device)
-        features = features.repeat_interleave(n_candidates, dim=0)
-        latents, k = actor.sample_latents(features, noise[0])
-        n_uniform = int(self.uniform_fraction * n_candidates)
-        if n_uniform > 0:
-            # Successive actions: all of them if there are no more than candidates
-            k_total = actor.codebook.n_discrete_actions
-            k.view(batch_size, -1)[:, :n_uniform] = (hashes[:, None] + th.arange(n_uniform, device=k.device)) % k_total
-            uniform = th.arange(len(k), device=k.device) % n_candidates < n_uniform
-            latents[uniform] = actor.codebook.representative_latents(k[uniform])
-        parameters = actor.sample_parameters(features, k, noise[1])
-        rows = th.cat([k[:, None].float(), parameters, latents], dim=1)
-        if n_candidates == 1:
-            return rows
-        critic_features = self.critic_target.features(observation).repeat_interleave(n_candidates, dim=0)
-        q_values = th.min(*self.critic_target.q_values(critic_features, latents, parameters))
-        best = q_values.view(batch_size, n_candidates).argmax(dim=1)
-        return rows.view(batch_size, n_candidates, -1)[th.arange(batch_size, device=best.device), best]
+        features, critic_features = actor.features(observation), self.critic_target.features(observation)
+        hashes = hash_observations(observation) if deterministic else None
+        latents, k, parameters, _ = self.best_candidate(actor, features, critic_features, self.n_action_candidates, hashes)
+        return th.cat([k[:, None].float(), parameters, latents], dim=1)
 
     def random_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Uniformly random actions; their latents scatter around the codewords and decode to the actions."""
