@@ -177,6 +177,18 @@ def test_critic_target():
     assert not th.isclose(shorter, loss)
 
 
+def test_best_of_several_next_actions_counts():
+    model = filled_model(n_target_candidates=4, gamma=0.9)
+    data = batch_of(model)
+    seen, q_values = [], model.critic_target.q_values
+    model.critic_target.q_values = lambda *args: seen.append(q_values(*args)) or seen[-1]
+    loss, _ = losses.critic_loss(model.policy, data, 4)
+    next_q = th.min(*seen[0]).view(32, 4).max(dim=1, keepdim=True).values
+    y = data.rewards + 0.9 * (1 - data.dones) * next_q
+    ours = model.critic.q_values(data.observations, data.latents, data.parameters)
+    th.testing.assert_close(loss, sum(F.mse_loss(q, y) for q in ours))
+
+
 def test_alpha_normalises_by_q():
     """The discrete loss is L_d - eta / mean|Q| * mean Q: scaling the critic leaves it unchanged."""
     model = filled_model()
@@ -254,7 +266,7 @@ def test_two_seeded_runs_are_identical():
     "kwargs", [dict(diffusion=False), dict(codebook=False), dict(sequential_update=False),
                dict(codebook=False, sequential_update=False), dict(improvement_q="min"), dict(improvement_q="mean"),
                dict(variance_type="fixed_small", beta_schedule="cosine"), dict(n_action_candidates=1),
-               dict(improvement_parameters="policy", uniform_fraction=0.5), dict(max_grad_norm=None),
+               dict(improvement_parameters="stored", uniform_fraction=0), dict(n_target_candidates=4), dict(max_grad_norm=None),
                dict(codebook_learning_rate=1e-4), dict(n_diffusion_steps=1)],
     ids=str,
 )  # fmt: skip
