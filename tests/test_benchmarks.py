@@ -4,6 +4,7 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch as th
 from torch import nn
@@ -15,7 +16,9 @@ sys.path.insert(0, str(BENCHMARKS))
 
 import cells  # noqa: E402
 import dql_style  # noqa: E402
+import release  # noqa: E402
 import tables  # noqa: E402
+import trials  # noqa: E402
 
 TINY = {
     "chdp": dict(n_diffusion_steps=2, learning_starts=40, n_envs=4, buffer_size=300, gradient_steps=1),
@@ -80,6 +83,28 @@ def test_tables(tmp_path):
     expected = 100 * sum(row["success"] for row in make_cell(tmp_path, "chdp").rows()[-5:]) / 4
     assert scores[scores["row"] == "chdp"]["success"].item() == pytest.approx(expected)
     assert "94.2 ± 1.7" in tables.markdown("main", scores)
+
+
+def test_log_of_trials(tmp_path):
+    cells.run_cell(make_cell(tmp_path / "smaller", "hppo"))
+    log = trials.read_trials(tmp_path)
+    assert len(log) == 1 and log.iloc[0]["trial"] == "smaller" and "n_steps=10" in log.iloc[0]["changes"]
+    assert log.iloc[0]["timesteps"] == 240
+
+
+@pytest.mark.parametrize("algo", ["chdp", "hyar_td3"])
+def test_published_models_act_as_the_trained_ones(algo, tmp_path):
+    cell = make_cell(tmp_path, algo)
+    cells.run_cell(cell)
+    trained, small = (cells.ALGORITHMS[algo].load(cell.path(".zip"), device="cpu") for _ in range(2))
+    release.shrink(small)
+    release.save_compressed(small, tmp_path / "small.zip")
+    assert (tmp_path / "small.zip").stat().st_size < 0.5 * cell.path(".zip").stat().st_size
+    published = cells.ALGORITHMS[algo].load(tmp_path / "small.zip", device="cpu")
+    obs = np.random.uniform(-1, 1, (20, 4)).astype(np.float32)
+    for expected, action in zip(*(model.predict(obs, deterministic=True)[0] for model in (trained, published)), strict=True):
+        assert expected[0] == action[0]
+        np.testing.assert_array_equal(expected[1][expected[0]], action[1][action[0]])
 
 
 def test_the_papers_figures_are_complete():
