@@ -52,6 +52,7 @@ class Cell:
     :param overrides: hyperparameters that differ from the YAML file
     :param eval_freq: environment steps between two evaluations, a thirtieth of the training if None
     :param eval_episodes: episodes of an evaluation
+    :param threads: threads of PyTorch
     """
 
     name: str
@@ -62,6 +63,7 @@ class Cell:
     overrides: dict[str, Any] = field(default_factory=dict)
     eval_freq: int | None = None
     eval_episodes: int = 100
+    threads: int = 1
 
     @property
     def stem(self) -> Path:
@@ -190,7 +192,7 @@ def run_cell(cell: Cell) -> str:
     """
     if cell.is_complete:
         return f"{cell.stem}: complete already"
-    th.set_num_threads(1)
+    th.set_num_threads(cell.threads)
     cell.stem.parent.mkdir(parents=True, exist_ok=True)
     model, rows = start_model(cell)
     resumed_at = model.num_timesteps
@@ -202,7 +204,7 @@ def run_cell(cell: Cell) -> str:
         "resumed_at": resumed_at,
         "versions": {"sb3_chdp": sb3_chdp.__version__, "stable_baselines3": sb3.__version__, "torch": th.__version__},
         "commit": commit,
-        "machine": f"{platform.machine()}, Python {platform.python_version()}, 1 thread",
+        "machine": f"{platform.machine()}, Python {platform.python_version()}, {cell.threads} thread(s)",
     }
     del meta["out"]
     model.save(cell.path(".zip"))

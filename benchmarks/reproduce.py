@@ -51,7 +51,12 @@ def make_cells(args: argparse.Namespace) -> list[Cell]:
     overrides = {key: yaml.safe_load(value) for key, value in (item.split("=", 1) for item in args.set)}
     if args.steps:
         overrides["n_timesteps"] = args.steps
-    common = dict(out=str(Path(args.out) / args.table), eval_freq=args.eval_freq, eval_episodes=args.eval_episodes)
+    common = dict(
+        out=str(Path(args.out) / args.table),
+        eval_freq=args.eval_freq,
+        eval_episodes=args.eval_episodes,
+        threads=args.threads,
+    )
     cells = []
     for seed in args.seeds:
         if args.table == "main":
@@ -97,7 +102,8 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--steps", type=int, help="environment steps (default: those of the YAML file)")
     parser.add_argument("--eval-freq", type=int, help="steps between evaluations (default: 30 evaluations)")
     parser.add_argument("--eval-episodes", type=int, default=100)
-    parser.add_argument("--jobs", type=int, default=1, help="cells at a time, one thread each")
+    parser.add_argument("--jobs", type=int, default=1, help="cells at a time, a process each")
+    parser.add_argument("--threads", type=int, default=1, help="threads of each; small networks are fastest with one")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="override hyperparameters (YAML values)")
     parser.add_argument("--out", default=str(RESULTS))
     return parser.parse_args()
@@ -108,7 +114,7 @@ def main() -> None:
     if args.table == "expressivity":
         expressivity.main()
         return
-    os.environ["OMP_NUM_THREADS"] = "1"  # of the worker processes
+    os.environ["OMP_NUM_THREADS"] = str(args.threads)  # of the worker processes
     cells = make_cells(args)
     started = time.time()
     with (
