@@ -24,7 +24,9 @@ from sb3_chdp.envs import ENV_IDS
 
 PUBLISHED = [("chdp", env_id) for env_id in ENV_IDS] + [("hyar_td3", "HardMove6-v0")]
 GIFS = ROOT.parent / "docs" / "images"
-GIF_WIDTH, MAX_FRAMES, EPISODES = 240, 150, 4
+GIF_WIDTH, MAX_PICTURES, EPISODES = 240, 120, 5
+# Of the environments whose steps have many frames
+FRAMES_PER_PICTURE = {"Platform-v0": 12, "Goal-v0": 5, "HardGoal-v0": 5}
 
 
 def shrink(model: BaseAlgorithm) -> None:
@@ -54,19 +56,28 @@ def save_compressed(model: BaseAlgorithm, path: Path) -> None:
 def record_gif(model: BaseAlgorithm, env_id: str, path: Path) -> None:
     """A GIF of a few episodes of deterministic actions."""
     env = gym.make(env_id, render_mode="rgb_array")
-    frames: list[Image.Image] = []
+    stride = FRAMES_PER_PICTURE.get(env_id, 1)
+    pictures: list[Image.Image] = []
+    n_frames = 0
+
+    def take_picture() -> None:
+        nonlocal n_frames
+        n_frames += 1
+        if n_frames % stride == 0 and len(pictures) < MAX_PICTURES:
+            picture = Image.fromarray(env.unwrapped.render())
+            pictures.append(picture.resize((GIF_WIDTH, GIF_WIDTH * picture.height // picture.width)).quantize(32))
+
+    env.unwrapped.frame_callback = take_picture
     for episode in range(EPISODES):
         obs, _ = env.reset(seed=episode)
         over = False
-        while not over and len(frames) < MAX_FRAMES:
+        while not over:
             action, _ = model.predict(obs, deterministic=True)
             obs, _, terminated, truncated, _ = env.step(action)
             over = terminated or truncated
-            frame = Image.fromarray(env.render())
-            frames.append(frame.resize((GIF_WIDTH, GIF_WIDTH * frame.height // frame.width)).quantize(32))
     env.close()
     path.parent.mkdir(parents=True, exist_ok=True)
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=100, loop=0, optimize=True)
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=80, loop=0, optimize=True)
 
 
 def main() -> None:

@@ -87,6 +87,23 @@ def test_rendering(env_id, monkeypatch):
     window.close()
 
 
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_frame_callback(env_id):
+    """It sees every frame inside a step, and changes nothing."""
+    watched, other = gym.make(env_id).unwrapped, gym.make(env_id).unwrapped
+    spec = HybridActionSpec(watched.action_space)
+    states = []
+    for env in (watched, other):
+        env.reset(seed=3)
+    watched.frame_callback = lambda: states.append(watched.get_state())
+    for row in spec.sample_rows(np.random.default_rng(0), 20):
+        states.clear()
+        (*_, info), (*_, other_info) = (env.step(spec.to_native(row)) for env in (watched, other))
+        assert len(states) == info["frames"] == other_info["frames"]
+        np.testing.assert_array_equal(watched.get_state(), other.get_state())
+        assert info["frames"] < 2 or (states[0] != states[-1]).any()
+
+
 @pytest.mark.parametrize("env_id, action", EDGES)
 def test_bad_actions(env_id, action):
     env = gym.make(env_id).unwrapped

@@ -1,5 +1,6 @@
 """What the five environments share: action decoding, noise draws and rendering."""
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
@@ -34,6 +35,8 @@ class HybridEnv(gym.Env[np.ndarray, Any]):
         self.noise = noise
         self.render_mode = render_mode
         self._canvas: Canvas | None = None
+        # Called after resets and after every frame inside a step: a window shows them all
+        self.frame_callback: Callable[[], Any] | None = self.render if render_mode == "human" else None
 
     def _set_action_space(self, bounds: list[list[tuple[float, float]]]) -> None:
         """:param bounds: for every discrete action the (low, high) of its parameters"""

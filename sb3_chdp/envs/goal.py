@@ -158,8 +158,8 @@ class GoalEnv(HybridEnv):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
         self._place_at_start(self.np_random.uniform(-PITCH_HALF_WIDTH, PITCH_HALF_WIDTH))
-        if self.render_mode == "human":
-            self.render()
+        if self.frame_callback is not None:
+            self.frame_callback()
         return self._observation(), {}
 
     def _place_at_start(self, player_y: float) -> None:
@@ -188,8 +188,6 @@ class GoalEnv(HybridEnv):
         reward = 0.0
         if outcome:
             reward = 50.0 if outcome == "goal" else -distance_to_goal(self.ball.x, self.ball.y)
-        if self.render_mode == "human":
-            self.render()
         info: dict[str, Any] = {"is_success": outcome == "goal", "frames": frames}
         if outcome:
             info["outcome"] = outcome
@@ -218,6 +216,8 @@ class GoalEnv(HybridEnv):
             collide(player, keeper)
             collide(player, ball)
             collide(keeper, ball)
+            if self.frame_callback is not None:
+                self.frame_callback()
             if outcome := self._outcome():
                 return outcome, frame
             if (

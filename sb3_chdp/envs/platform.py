@@ -107,16 +107,14 @@ class PlatformEnv(HybridEnv):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
         self._place_at_start()
-        if self.render_mode == "human":
-            self.render()
+        if self.frame_callback is not None:
+            self.frame_callback()
         return self._observation(), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         k, (parameter,) = self._decode(action)
         low, high = PARAMETER_BOUNDS[k]
         reward, outcome, frames = self._simulate(k, min(max(parameter, low), high))
-        if self.render_mode == "human":
-            self.render()
         info: dict[str, Any] = {"is_success": outcome == "finish", "frames": frames}
         if outcome:
             info["outcome"] = outcome
@@ -179,6 +177,9 @@ class PlatformEnv(HybridEnv):
 
             if y < GROUND:
                 x, y, vx, vy = separate(x, y, vx, vy)
+            if self.frame_callback is not None:
+                self.x, self.y, self.vx, self.vy = x, y, vx, vy
+                self.frame_callback()
             if x >= FINISH:
                 outcome = "finish"
             elif y < GROUND:

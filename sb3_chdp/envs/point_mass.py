@@ -59,8 +59,8 @@ class PointMassEnv(HybridEnv):
         )
         self.vx = self.vy = 0.0
         self._force = (0.0, 0.0)
-        if self.render_mode == "human":
-            self.render()
+        if self.frame_callback is not None:
+            self.frame_callback()
         return self._observation(), {}
 
     def _push(self, fx: float, fy: float) -> float:
@@ -77,8 +77,8 @@ class PointMassEnv(HybridEnv):
         return (self.x - self.target_x) ** 2 + (self.y - self.target_y) ** 2
 
     def _result(self, reward: float, terminated: bool) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        if self.render_mode == "human":
-            self.render()
+        if self.frame_callback is not None:
+            self.frame_callback()
         return self._observation(), reward, terminated, False, {"is_success": reward > SUCCESS_REWARD, "frames": 1}
 
     def _observation(self) -> np.ndarray:
