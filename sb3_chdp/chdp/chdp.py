@@ -9,6 +9,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, update_learning_rate
 
+from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.losses import (
     IMPROVEMENT_PARAMETERS,
     IMPROVEMENT_QS,
@@ -17,7 +18,7 @@ from sb3_chdp.chdp.losses import (
     discrete_policy_loss,
     relabel_latents,
 )
-from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, CooperativeActor, MlpPolicy, MultiInputPolicy
+from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.policies import HybridCritic

@@ -1,0 +1,92 @@
+"""The two cooperating policies of CHDP with the codebook between them."""
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_chdp.chdp.codebook import Codebook, OneHotCodebook
+from sb3_chdp.chdp.diffusion import DeterministicModel, DiffusionModel
+from sb3_chdp.common.hybrid_box import HybridBox
+
+
+class CooperativeActor(BaseModel):
+    """
+    The two agents of the cooperative game.
+
+    The discrete policy draws a latent e, the codebook decodes it to k and e_k, and the continuous policy, conditioned on
+    the state and e_k, draws the parameters.
+
+    :param observation_space: observation space
+    :param action_space: space of the action rows
+    :param features_extractor: network to extract features, the same for both agents
+    :param codebook: quantises the latents
+    :param discrete_policy: model of the latents given the features
+    :param continuous_policy: model of the parameters given the features and a codeword
+    :param normalize_images: whether to divide images by 255
+    """
+
+    features_extractor: BaseFeaturesExtractor
+    parameter_mask: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: HybridBox,
+        features_extractor: BaseFeaturesExtractor,
+        codebook: Codebook | OneHotCodebook,
+        discrete_policy: DiffusionModel | DeterministicModel,
+        continuous_policy: DiffusionModel | DeterministicModel,
+        normalize_images: bool = True,
+    ):
+        super().__init__(
+            observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
+        )
+        self.codebook = codebook
+        self.discrete_policy = discrete_policy
+        self.continuous_policy = continuous_policy
+        mask = action_space.spec.mask
+        self._has_padding = not bool(mask.all())
+        # Not needed when no action has padding, and then not kept: K may be 65,536
+        self.register_buffer(
+            "parameter_mask", th.tensor(mask if self._has_padding else mask[:1], dtype=th.float32), persistent=False
+        )
+
+    def features(self, obs: PyTorchObs) -> th.Tensor:
+        """:return: (B, features_dim) features of the observations"""
+        return self.extract_features(obs, self.features_extractor)
+
+    def mask(self, k: th.Tensor) -> th.Tensor | None:
+        """:return: (B, Pmax) 1 for the parameters that action k has, None if no action has padding"""
+        return self.parameter_mask[k] if self._has_padding else None
+
+    def sample_latents(self, features: th.Tensor, noise: th.Tensor | None = None) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param features: (B, features_dim)
+        :param noise: noise of the discrete policy's chain, drawn if None
+        :return: latents (B, latent_dim) and the discrete actions (B,) that they decode to
+        """
+        latents = self.discrete_policy.sample(features, noise)
+        return latents, self.codebook.quantize(latents)
+
+    def sample_parameters(self, features: th.Tensor, k: th.Tensor, noise: th.Tensor | None = None) -> th.Tensor:
+        """
+        :param features: (B, features_dim)
+        :param k: (B,) discrete actions
+        :param noise: noise of the continuous policy's chain, drawn if None
+        :return: (B, Pmax) parameters in [-1, 1], padding 0; their gradient reaches the codewords of k
+        """
+        condition = th.cat([features, self.codebook(k)], dim=1)
+        return self.continuous_policy.sample(condition, noise, self.mask(k))
+
+    def sample(
+        self, features: th.Tensor, noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None)
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """
+        :param features: (B, features_dim)
+        :param noise: noise of the two chains, drawn if None
+        :return: latents (B, latent_dim), discrete actions (B,), parameters (B, Pmax)
+        """
+        latents, k = self.sample_latents(features, noise[0])
+        return latents, k, self.sample_parameters(features, k, noise[1])
