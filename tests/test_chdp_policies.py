@@ -29,7 +29,7 @@ def test_codebook_stays_where_the_latents_are():
     model = filled_model()
     with th.no_grad():
         model.actor.codebook.codewords[0] = 0.9999
-    model.codebook_learning_rate = 0.5
+    model.codebook_lr_factor = 500.0
     model._setup_model()
     model.replay_buffer = filled_model().replay_buffer
     model.train(3, 32)
@@ -123,9 +123,9 @@ def test_random_rows_decode_to_their_action(k_total):
     assert np.abs(rows[:, 1:]).max() <= 1
 
 
-def test_codebook_learning_rate_schedule():
-    model = filled_model(codebook_learning_rate=lambda progress: 0.5 * progress)
+def test_the_codebook_follows_the_learning_rate():
+    model = filled_model(learning_rate=lambda progress: 0.01 * progress, codebook_lr_factor=0.5)
     model._current_progress_remaining = 0.1
     model.train(1, 32)
-    assert model.policy.codebook_optimizer.param_groups[0]["lr"] == pytest.approx(0.05)
     assert model.policy.continuous_optimizer.param_groups[0]["lr"] == pytest.approx(1e-3)
+    assert model.policy.codebook_optimizer.param_groups[0]["lr"] == pytest.approx(5e-4)

@@ -7,7 +7,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, get_parameters_by_name, update_learning_rate
+from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
 
 from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.losses import (
@@ -84,8 +84,8 @@ class CHDP(HybridOffPolicyAlgorithm):
         the same way (1: the paper)
     :param relabel_latents: whether a stored latent that does not decode to the stored discrete action any more is
         replaced by that action's present codeword
-    :param codebook_learning_rate: learning rate of the codebook; the faster it moves, the more stored latents
-        decode to other actions (``train/latent_drift``)
+    :param codebook_lr_factor: learning rate of the codebook relative to that of the networks; the faster it moves, the
+        more stored latents decode to other actions (``train/latent_drift``)
     :param max_grad_norm: bound on the gradient norm of every network, None for none
     :param policy_delay: policies and targets are updated once every ``policy_delay`` critic updates
     :param diffusion: False replaces both diffusion policies by deterministic MLPs (ablation)
@@ -149,7 +149,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         n_action_candidates: int = 16,
         n_target_candidates: int = 1,
         relabel_latents: bool = True,
-        codebook_learning_rate: float | Schedule = 1e-4,
+        codebook_lr_factor: float = 0.1,
         max_grad_norm: float | None = 1.0,
         policy_delay: int = 1,
         diffusion: bool = True,
@@ -220,7 +220,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         self.n_action_candidates = n_action_candidates
         self.n_target_candidates = n_target_candidates
         self.relabel_latents = relabel_latents
-        self.codebook_learning_rate = codebook_learning_rate
+        self.codebook_lr_factor = codebook_lr_factor
         self.max_grad_norm = max_grad_norm
         self.policy_delay = policy_delay
         self.diffusion = diffusion
@@ -251,7 +251,6 @@ class CHDP(HybridOffPolicyAlgorithm):
     def _setup_model(self) -> None:
         super()._setup_model()
         self._create_aliases()
-        self.codebook_lr_schedule = FloatSchedule(self.codebook_learning_rate)
         online, target = (self.actor, self.critic), (self.actor_target, self.critic_target)
         # The features extractor may be shared: a dict counts it once
         self._online_params = list(dict.fromkeys(p for net in online for p in net.parameters()))
@@ -325,7 +324,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         policy = self.policy
         self._update_learning_rate([policy.critic.optimizer, policy.discrete_optimizer, policy.continuous_optimizer])
         if policy.codebook_optimizer is not None:
-            rate = self.codebook_lr_schedule(self._current_progress_remaining)
+            rate = self.codebook_lr_factor * self.lr_schedule(self._current_progress_remaining)
             update_learning_rate(policy.codebook_optimizer, rate)
             self.logger.record("train/codebook_learning_rate", rate)
 
