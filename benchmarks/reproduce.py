@@ -26,13 +26,15 @@ from rich.table import Table
 
 from sb3_chdp.envs import ENV_IDS
 
-# Row of the ablation table: arguments of CHDP; all with the paper's default parameters and policy losses
+# Row of the ablation table: arguments of CHDP; all with the paper's default parameters, losses and critics
 PAPER_DEFAULTS = {
     "n_diffusion_steps": 15,
     "eta": 10.0,
     "latent_dim": 8,
     "improvement_parameters": "stored",
     "uniform_fraction": 0.0,
+    "n_target_candidates": 1,
+    "policy_kwargs": {"layer_norm": False},
 }
 ABLATION = {
     "full": {},

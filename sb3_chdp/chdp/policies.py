@@ -1,5 +1,6 @@
 """Networks of CHDP: a discrete and a continuous diffusion policy, their codebook, the twin critic and all targets."""
 
+import math
 from copy import deepcopy
 from typing import Any
 
@@ -47,6 +48,7 @@ class CHDPPolicy(HybridPolicy):
     :param optimizer_kwargs: its keyword arguments, without the learning rate; ``fused=True`` for Adam if None
     :param share_features_extractor: whether both agents use the critic's features extractor, which then learns from the
         critic's loss alone; otherwise they have their own, which learns from the loss of the discrete policy
+    :param layer_norm: whether the critics have layer normalisation, see :class:`HybridCritic`
     :param diffusion: whether the policies are diffusion models (False: deterministic MLPs)
     :param codebook: whether discrete actions are represented by codewords (False: one-hot vectors)
     :param n_diffusion_steps: number N of denoising steps
@@ -74,6 +76,7 @@ class CHDPPolicy(HybridPolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = False,
+        layer_norm: bool = True,
         diffusion: bool = True,
         codebook: bool = True,
         n_diffusion_steps: int = 15,
@@ -99,6 +102,7 @@ class CHDPPolicy(HybridPolicy):
         self.net_arch = {"pi": [128, 128], "qf": [256, 256]} if net_arch is None else net_arch
         self.activation_fn = activation_fn
         self.share_features_extractor = share_features_extractor
+        self.layer_norm = layer_norm
         self.diffusion = diffusion
         self.use_codebook = codebook
         self.n_diffusion_steps = n_diffusion_steps
@@ -124,6 +128,7 @@ class CHDPPolicy(HybridPolicy):
             features_dim,
             self.activation_fn,
             self.normalize_images,
+            self.layer_norm,
         )
         k_total = spec.n_discrete_actions
         codebook = Codebook(k_total, latent_dim) if self.use_codebook else OneHotCodebook(k_total)
@@ -195,7 +200,7 @@ class CHDPPolicy(HybridPolicy):
         :param actor: the policies
         :param features: (B, features_dim) features for the policies
         :param critic_features: (B, features_dim) features for the target critics
-        :param n_candidates: number of actions drawn per row, a share ``uniform_fraction`` of them with random k
+        :param n_candidates: number of actions drawn per row, a share ``uniform_fraction`` of them, rounded up, with random k
         :param hashes: (B,) numbers that decide the noise of the row; random noise if None
         :return: latents (B, latent_dim), discrete actions (B,), parameters (B, Pmax) and their min(Q1, Q2) (B, 1)
         """
@@ -208,7 +213,7 @@ class CHDPPolicy(HybridPolicy):
             features = features.repeat_interleave(n_candidates, dim=0)
             critic_features = critic_features.repeat_interleave(n_candidates, dim=0)
         latents, k = actor.sample_latents(features, noise[0])
-        n_uniform = int(self.uniform_fraction * n_candidates)
+        n_uniform = math.ceil(self.uniform_fraction * n_candidates) if n_candidates > 1 else 0
         if n_uniform > 0:
             if hashes is None:
                 hashes = th.randint(2**31, (batch_size,), device=device)
@@ -282,6 +287,7 @@ class CHDPPolicy(HybridPolicy):
                 optimizer_class=self.optimizer_class,
                 optimizer_kwargs=self.optimizer_kwargs,
                 share_features_extractor=self.share_features_extractor,
+                layer_norm=self.layer_norm,
                 diffusion=self.diffusion,
                 codebook=self.use_codebook,
                 n_diffusion_steps=self.n_diffusion_steps,

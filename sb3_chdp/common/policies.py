@@ -6,7 +6,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
@@ -121,6 +121,8 @@ class HybridCritic(ContinuousCritic):
     :param features_dim: number of features
     :param activation_fn: activation function
     :param normalize_images: whether to divide images by 255
+    :param layer_norm: whether every hidden layer is followed by layer normalisation, which bounds Q where there is no data
+        (Ball et al., 2023)
     """
 
     def __init__(
@@ -132,6 +134,7 @@ class HybridCritic(ContinuousCritic):
         features_dim: int,
         activation_fn: type[nn.Module] = nn.ReLU,
         normalize_images: bool = True,
+        layer_norm: bool = False,
     ):
         super().__init__(
             observation_space,
@@ -144,6 +147,12 @@ class HybridCritic(ContinuousCritic):
             n_critics=2,
             share_features_extractor=False,
         )
+        if layer_norm:
+            for i in range(self.n_critics):
+                modules: list[type[nn.Module]] = [nn.LayerNorm]
+                q_net = create_mlp(features_dim + action_dim, 1, net_arch, activation_fn, post_linear_modules=modules)
+                self.q_networks[i] = nn.Sequential(*q_net)
+                self.add_module(f"qf{i}", self.q_networks[i])
 
     def features(self, obs: PyTorchObs) -> th.Tensor:
         """:return: (B, features_dim) features of the observations"""
