@@ -47,8 +47,7 @@ class CHDP(HybridOffPolicyAlgorithm):
            candidates, see ``uniform_fraction`` (0: the paper);
         5. latents from the buffer that no longer decode to the action taken are replaced, see ``relabel_latents``;
         6. gradient norms are clipped, see ``max_grad_norm``;
-        7. the critics have layer normalisation, see ``layer_norm`` of :class:`CHDPPolicy` (False: the paper);
-        8. codewords are kept in [-1, 1], where the latents are (not an argument: without it they drift away, and latents
+        7. codewords are kept in [-1, 1], where the latents are (not an argument: without it they drift away, and latents
            can no longer reach them).
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)

@@ -48,7 +48,8 @@ class CHDPPolicy(HybridPolicy):
     :param optimizer_kwargs: its keyword arguments, without the learning rate; ``fused=True`` for Adam if None
     :param share_features_extractor: whether both agents use the critic's features extractor, which then learns from the
         critic's loss alone; otherwise they have their own, which learns from the loss of the discrete policy
-    :param layer_norm: whether the critics have layer normalisation, see :class:`HybridCritic`
+    :param layer_norm: whether the critics have layer normalisation, see :class:`HybridCritic`; it steadies and speeds up
+        learning with few discrete actions, and slows it down with many
     :param diffusion: whether the policies are diffusion models (False: deterministic MLPs)
     :param codebook: whether discrete actions are represented by codewords (False: one-hot vectors)
     :param n_diffusion_steps: number N of denoising steps
@@ -76,7 +77,7 @@ class CHDPPolicy(HybridPolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = False,
-        layer_norm: bool = True,
+        layer_norm: bool = False,
         diffusion: bool = True,
         codebook: bool = True,
         n_diffusion_steps: int = 15,
