@@ -71,7 +71,7 @@ def plot_draws(draws: dict[str, pd.DataFrame]) -> None:
         axis.axvline(0, color="lightgray", zorder=0)
     axes[0].set_ylabel("force y")
     figure.tight_layout()
-    figure.savefig(FIGURES / "expressivity.png", dpi=100)
+    figure.savefig(FIGURES / "expressivity.png", dpi=100, bbox_inches="tight")
 
 
 def plot_codebook(codewords: np.ndarray) -> None:
