@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar, TypeVar
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
@@ -10,6 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
 
 from sb3_chdp.chdp.actor import CooperativeActor
+from sb3_chdp.chdp.exploration import vary_parts
 from sb3_chdp.chdp.losses import (
     IMPROVEMENT_PARAMETERS,
     IMPROVEMENT_QS,
@@ -40,7 +42,7 @@ class CHDP(HybridOffPolicyAlgorithm):
 
     Differences from the paper:
         1. the action of highest Q among ``n_action_candidates`` draws acts (1: the paper);
-        2. uniformly random actions with a decreasing probability, see ``exploration_initial_eps`` (0: the paper);
+        2. random actions with a decreasing probability, see ``exploration_initial_eps`` (0: the paper) and ``explore_parts``;
         3. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
            stored ones, see ``improvement_parameters`` ("stored": the paper);
         4. the continuous policy is improved for uniformly random discrete actions too, some of which are among the
@@ -95,6 +97,8 @@ class CHDP(HybridOffPolicyAlgorithm):
     :param exploration_noise: standard deviation of the exploration noise if ``diffusion`` is False
     :param action_layout: how to read an ambiguous action space, "auto", "per_action" or "shared",
         see :class:`HybridActionSpec`
+    :param explore_parts: whether exploration also varies the discrete action or the parameters alone, see
+        :func:`vary_parts`; otherwise all exploratory actions are uniformly random
     :param exploration_fraction: fraction of the training over which the rate of uniformly random actions is reduced
     :param exploration_initial_eps: initial probability of a uniformly random action
     :param exploration_final_eps: final probability of a uniformly random action
@@ -157,6 +161,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         sequential_update: bool = True,
         exploration_noise: float = 0.1,
         action_layout: str = "auto",
+        explore_parts: bool = False,
         exploration_fraction: float = 0.2,
         exploration_initial_eps: float = 1.0,
         exploration_final_eps: float = 0.05,
@@ -227,6 +232,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         self.codebook = codebook
         self.sequential_update = sequential_update
         self.exploration_noise = exploration_noise
+        self.explore_parts = explore_parts
 
         if _init_setup_model:
             self._setup_model()
@@ -318,6 +324,12 @@ class CHDP(HybridOffPolicyAlgorithm):
             self.logger.record(f"train/{name}", th.stack(values).mean().item())
         if "continuous_loss" in logs:
             self._log_codebook_usage(k)
+
+    def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        if not self.explore_parts:
+            return super()._exploratory_rows(rows, rng)
+        assert self._last_obs is not None, "self._last_obs was not set"
+        return vary_parts(self.policy, self._last_obs, rows, rng)  # type: ignore[arg-type]
 
     def _update_learning_rates(self) -> None:
         """Set the learning rates of all optimizers according to their schedules."""

@@ -114,26 +114,32 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         :return: native actions for the environments, (n_envs, columns) rows for the replay buffer
         """
         rng = self.action_space.np_random
-        explores = np.ones(n_envs, dtype=bool)
-        if self.num_timesteps >= learning_starts:
-            explores = rng.random(n_envs) < self.exploration_schedule(self._current_progress_remaining)
-        if explores.all():
+        if self.num_timesteps < learning_starts:
             rows = self.policy.random_rows(rng, n_envs)
+            return self.hybrid_space.to_native(rows), rows
+        explores = rng.random(n_envs) < self.exploration_schedule(self._current_progress_remaining)
+        assert self._last_obs is not None, "self._last_obs was not set"
+        noise = self._draw_noise(n_envs) if action_noise is None else action_noise()
+        if noise is not None and np.size(noise) != n_envs * self.policy.noise_dim:
+            raise ValueError(
+                f"action_noise must have size {self.policy.noise_dim} per environment, got shape {np.shape(noise)} "
+                f"for {n_envs} environment(s)"
+            )
+        if noise is None:
+            rows = self.policy.predict_rows(self._last_obs)  # type: ignore[arg-type]
         else:
-            assert self._last_obs is not None, "self._last_obs was not set"
-            noise = self._draw_noise(n_envs) if action_noise is None else action_noise()
-            if noise is not None and np.size(noise) != n_envs * self.policy.noise_dim:
-                raise ValueError(
-                    f"action_noise must have size {self.policy.noise_dim} per environment, got shape {np.shape(noise)} "
-                    f"for {n_envs} environment(s)"
-                )
-            if noise is None:
-                rows = self.policy.predict_rows(self._last_obs)  # type: ignore[arg-type]
-            else:
-                rows = self.policy.noisy_rows(self._last_obs, noise)  # type: ignore[arg-type]
-            if explores.any():
-                rows[explores] = self.policy.random_rows(rng, int(explores.sum()))
+            rows = self.policy.noisy_rows(self._last_obs, noise)  # type: ignore[arg-type]
+        if explores.any():
+            rows[explores] = self._exploratory_rows(rows, rng)[explores]
         return self.hybrid_space.to_native(rows), rows
+
+    def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """
+        :param rows: (n, columns) what the policy would do
+        :param rng: random generator
+        :return: (n, columns) what exploration does instead: uniformly random actions
+        """
+        return self.policy.random_rows(rng, len(rows))
 
     def _draw_noise(self, n_envs: int) -> np.ndarray | None:
         if self.exploration_noise_schedule is None:

@@ -1,0 +1,53 @@
+"""Exploration of the parts of a hybrid action, each on its own."""
+
+import numpy as np
+import torch as th
+
+from sb3_chdp.chdp.policies import CHDPPolicy
+
+# Smallest and largest standard deviation of the noise on scaled parameters
+NOISE_SCALES = (0.03, 1.0)
+
+
+def reflect(x: np.ndarray) -> np.ndarray:
+    """:return: x with what lies beyond -1 or 1 folded back; clipping would gather half of the noise around a bound on it"""
+    x = np.where(x > 1, 2 - x, np.where(x < -1, -2 - x, x))
+    return np.clip(x, -1, 1)
+
+
+def vary_parts(
+    policy: CHDPPolicy, observation: np.ndarray | dict[str, np.ndarray], rows: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """
+    Replace a part of each action, or all of it.
+
+    With equal probability: a uniformly random discrete action with the parameters that the continuous policy draws for it;
+    the same discrete action with uniformly random parameters; the same action with Gaussian noise on its parameters, whose
+    standard deviation is log-uniform in ``NOISE_SCALES``; a uniformly random action. In a large parameter box of which a
+    small part is of use, the last alone hardly ever tries what is better than the present action.
+
+    :param policy: the policies
+    :param observation: n observations
+    :param rows: (n, columns) the policy's actions
+    :param rng: random generator
+    :return: (n, columns) rows
+    """
+    n, spec = len(rows), policy.action_space.spec
+    columns = slice(1, spec.row_size)
+    shape = rows[:, columns].shape
+    kinds = rng.integers(4, size=(n, 1))
+
+    random = policy.random_rows(rng, n)
+    of_random_k = random.copy()
+    with th.no_grad():
+        features = policy.actor.features(policy.obs_to_tensor(observation)[0])
+        k = th.as_tensor(random[:, 0], device=policy.device).long()
+        of_random_k[:, columns] = policy.actor.sample_parameters(features, k).cpu().numpy()
+
+    mask = spec.mask[rows[:, 0].astype(int)]
+    elsewhere, nearby = rows.copy(), rows.copy()
+    elsewhere[:, columns] = rng.uniform(-1, 1, shape) * mask
+    low, high = np.log(NOISE_SCALES)
+    scales = np.exp(rng.uniform(low, high, (n, 1)))
+    nearby[:, columns] = reflect(rows[:, columns] + scales * rng.normal(size=shape)) * mask
+    return np.choose(kinds, [of_random_k, elsewhere, nearby, random])
