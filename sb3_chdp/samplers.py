@@ -95,7 +95,8 @@ def convert_chdp_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     hyperparams["gamma"] = 1 - hyperparams.pop("one_minus_gamma")
     for name in ("batch_size", "latent_dim", "gradient_steps", "n_target_candidates"):
         hyperparams[name] = 2 ** hyperparams.pop(f"{name}_pow")
-    hyperparams["policy_kwargs"] = {"net_arch": NET_ARCHS[hyperparams.pop("net_arch")]}
+    net_arch = NET_ARCHS[hyperparams.pop("net_arch")]
+    hyperparams["policy_kwargs"] = {"net_arch": net_arch, "layer_norm": hyperparams.pop("layer_norm")}
     return hyperparams
 
 
@@ -122,6 +123,8 @@ def sample_chdp_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
         # From 1 to 2**3=8
         "n_target_candidates_pow": trial.suggest_int("n_target_candidates_pow", 0, 3),
         "uniform_fraction": trial.suggest_categorical("uniform_fraction", [0.0, 0.25, 0.5]),
+        "explore_parts": trial.suggest_categorical("explore_parts", [False, True]),
+        "layer_norm": trial.suggest_categorical("layer_norm", [False, True]),
         "tau": trial.suggest_float("tau", 0.001, 0.05, log=True),
         "eta": trial.suggest_float("eta", 1.0, 30.0, log=True),
         "n_diffusion_steps": trial.suggest_int("n_diffusion_steps", 5, 15, step=5),
