@@ -80,13 +80,14 @@ class CooperativeActor(BaseModel):
         condition = th.cat([features, self.codebook(k)], dim=1)
         return self.continuous_policy.sample(condition, noise, self.mask(k))
 
-    def sample(
-        self, features: th.Tensor, noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None)
-    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+    def random_actions(self, n: int) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """
-        :param features: (B, features_dim)
-        :param noise: noise of the two chains, drawn if None
-        :return: latents (B, latent_dim), discrete actions (B,), parameters (B, Pmax)
+        Uniformly random actions.
+
+        :param n: number of actions
+        :return: codewords as latents (n, latent_dim), discrete actions (n, 1), parameters (n, Pmax), padding 0
         """
-        latents, k = self.sample_latents(features, noise[0])
-        return latents, k, self.sample_parameters(features, k, noise[1])
+        k = th.randint(self.codebook.n_discrete_actions, (n,), device=self.device)
+        parameters = 2 * th.rand(n, self.continuous_policy.dim, device=self.device) - 1
+        mask = self.mask(k)
+        return self.codebook.representative_latents(k), k[:, None], parameters if mask is None else parameters * mask

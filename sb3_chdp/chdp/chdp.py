@@ -82,6 +82,8 @@ class CHDP(HybridOffPolicyAlgorithm):
         for, and among the candidates
     :param n_action_candidates: number of actions drawn per observation when acting; the one with the highest min(Q1, Q2)
         of the target critics is taken
+    :param n_random_candidates: number of uniformly random actions that compete with these in rollouts: a search for what the
+        critics value and the policies have not found; best with ``layer_norm`` of :class:`CHDPPolicy` (0: the paper)
     :param n_target_candidates: number of next actions drawn per transition for the target of the critics, chosen from in
         the same way (1: the paper)
     :param relabel_latents: whether a stored latent that does not decode to the stored discrete action any more is
@@ -151,6 +153,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         improvement_parameters: str = "policy",
         uniform_fraction: float = 0.25,
         n_action_candidates: int = 16,
+        n_random_candidates: int = 0,
         n_target_candidates: int = 1,
         relabel_latents: bool = True,
         codebook_lr_factor: float = 0.1,
@@ -223,6 +226,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         self.improvement_parameters = improvement_parameters
         self.uniform_fraction = uniform_fraction
         self.n_action_candidates = n_action_candidates
+        self.n_random_candidates = n_random_candidates
         self.n_target_candidates = n_target_candidates
         self.relabel_latents = relabel_latents
         self.codebook_lr_factor = codebook_lr_factor
@@ -245,6 +249,7 @@ class CHDP(HybridOffPolicyAlgorithm):
             beta_schedule=self.beta_schedule,
             variance_type=self.variance_type,
             n_action_candidates=self.n_action_candidates,
+            n_random_candidates=self.n_random_candidates,
             uniform_fraction=self.uniform_fraction,
             exploration_noise=self.exploration_noise,
         )

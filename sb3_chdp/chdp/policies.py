@@ -57,7 +57,8 @@ class CHDPPolicy(HybridPolicy):
     :param variance_type: see :class:`NoiseSchedule`
     :param n_action_candidates: number of actions drawn per observation, of which the one with the highest min(Q1, Q2) of
         the target critics acts
-    :param uniform_fraction: share of these candidates whose discrete action is uniformly random
+    :param n_random_candidates: number of uniformly random actions that compete with these, unless deterministic
+    :param uniform_fraction: share of the drawn candidates whose discrete action is uniformly random
     :param exploration_noise: standard deviation of the exploration noise of policies without diffusion
     """
 
@@ -84,6 +85,7 @@ class CHDPPolicy(HybridPolicy):
         beta_schedule: str = "vp",
         variance_type: str = "fixed_large",
         n_action_candidates: int = 16,
+        n_random_candidates: int = 0,
         uniform_fraction: float = 0.25,
         exploration_noise: float = 0.1,
     ):
@@ -110,6 +112,7 @@ class CHDPPolicy(HybridPolicy):
         self.beta_schedule = beta_schedule
         self.variance_type = variance_type
         self.n_action_candidates = n_action_candidates
+        self.n_random_candidates = n_random_candidates
         self.uniform_fraction = uniform_fraction
         self.exploration_noise = exploration_noise
         self._build(lr_schedule)
@@ -194,6 +197,7 @@ class CHDPPolicy(HybridPolicy):
         critic_features: th.Tensor,
         n_candidates: int,
         hashes: th.Tensor | None = None,
+        n_random: int = 0,
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
         """
         Draw actions and keep the one of highest min(Q1, Q2) of the target critics.
@@ -203,6 +207,7 @@ class CHDPPolicy(HybridPolicy):
         :param critic_features: (B, features_dim) features for the target critics
         :param n_candidates: number of actions drawn per row, a share ``uniform_fraction`` of them, rounded up, with random k
         :param hashes: (B,) numbers that decide the noise of the row; random noise if None
+        :param n_random: number of uniformly random actions per row that compete with those
         :return: latents (B, latent_dim), discrete actions (B,), parameters (B, Pmax) and their min(Q1, Q2) (B, 1)
         """
         batch_size, device = features.shape[0], features.device
@@ -210,9 +215,10 @@ class CHDPPolicy(HybridPolicy):
         if hashes is not None:
             chains = (hashes[:, None] + th.arange(n_candidates, device=device)).flatten() % FIXED_NOISE_CHAINS
             noise = (self.fixed_latent_noise[..., chains, :], self.fixed_parameter_noise[..., chains, :])
-        if n_candidates > 1:
+        n_total = n_candidates + n_random
+        if n_total > 1:
             features = features.repeat_interleave(n_candidates, dim=0)
-            critic_features = critic_features.repeat_interleave(n_candidates, dim=0)
+            critic_features = critic_features.repeat_interleave(n_total, dim=0)
         latents, k = actor.sample_latents(features, noise[0])
         n_uniform = math.ceil(self.uniform_fraction * n_candidates) if n_candidates > 1 else 0
         if n_uniform > 0:
@@ -224,15 +230,23 @@ class CHDPPolicy(HybridPolicy):
             uniform = th.arange(len(k), device=device) % n_candidates < n_uniform
             latents[uniform] = actor.codebook.representative_latents(k[uniform])
         parameters = actor.sample_parameters(features, k, noise[1])
+        if n_random > 0:
+            drawn, random = (latents, k[:, None], parameters), actor.random_actions(batch_size * n_random)
+            latents, k, parameters = (
+                th.cat([a.view(batch_size, n_candidates, -1), b.view(batch_size, n_random, -1)], dim=1).flatten(0, 1)
+                for a, b in zip(drawn, random, strict=True)
+            )
+            k = k[:, 0]
         q_values = th.min(*self.critic_target.q_values(critic_features, latents, parameters))
-        if n_candidates == 1:
+        if n_total == 1:
             return latents, k, parameters, q_values
-        best = q_values.view(batch_size, n_candidates).argmax(dim=1) + th.arange(batch_size, device=device) * n_candidates
+        best = q_values.view(batch_size, n_total).argmax(dim=1) + th.arange(batch_size, device=device) * n_total
         return latents[best], k[best], parameters[best], q_values[best]
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """
-        Draw ``n_action_candidates`` actions per observation and keep the one of highest target min(Q1, Q2).
+        Draw ``n_action_candidates`` actions per observation and keep the one of highest target min(Q1, Q2). Predictions that
+        are not deterministic choose from ``n_random_candidates`` uniformly random actions as well.
 
         Deterministic predictions take their noise from a fixed store, at a place that depends on the observation: one and
         the same noise in all states would repeat a policy's mistakes where sampling gets away from them. They use the
@@ -243,7 +257,14 @@ class CHDPPolicy(HybridPolicy):
         actor = self.actor_target if deterministic else self.actor
         features, critic_features = actor.features(observation), self.critic_target.features(observation)
         hashes = hash_observations(observation) if deterministic else None
-        latents, k, parameters, _ = self.best_candidate(actor, features, critic_features, self.n_action_candidates, hashes)
+        latents, k, parameters, _ = self.best_candidate(
+            actor,
+            features,
+            critic_features,
+            self.n_action_candidates,
+            hashes,
+            0 if deterministic else self.n_random_candidates,
+        )
         return th.cat([k[:, None].float(), parameters, latents], dim=1)
 
     def random_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
@@ -295,6 +316,7 @@ class CHDPPolicy(HybridPolicy):
                 beta_schedule=self.beta_schedule,
                 variance_type=self.variance_type,
                 n_action_candidates=self.n_action_candidates,
+                n_random_candidates=self.n_random_candidates,
                 uniform_fraction=self.uniform_fraction,
                 exploration_noise=self.exploration_noise,
                 lr_schedule=self._dummy_schedule,  # dummy lr schedule, not needed for loading policy alone
