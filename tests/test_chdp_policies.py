@@ -113,6 +113,26 @@ def test_the_best_candidate_acts(uniform_fraction, deterministic):
     assert uniform_fraction == 0 or (covered == 2).all()
 
 
+def test_random_candidates_find_what_the_policies_miss():
+    """With a critic that values parameters near 0.7 alone, rollouts get there and deterministic predictions do not."""
+    model = filled_model(n_action_candidates=1, n_random_candidates=64)
+    with th.no_grad():
+        for parameter in model.actor_target.continuous_policy.parameters():
+            parameter.zero_()
+        model.actor.continuous_policy.load_state_dict(model.actor_target.continuous_policy.state_dict())
+
+    def q_values(features, latents, parameters):
+        assert len(features) == len(latents) == len(parameters)
+        return (-(parameters - 0.7).abs(),) * 2
+
+    model.critic_target.q_values = q_values
+    obs = np.random.uniform(-1, 1, (50, 4)).astype(np.float32)
+    error = {d: np.abs(model.policy.predict_rows(obs, d)[:, 1] - 0.7).mean() for d in (False, True)}
+    assert error[False] < 0.1 < error[True]
+    rows = model.policy.predict_rows(obs)
+    assert (model.actor.codebook.quantize(th.as_tensor(rows[:, 2:])).numpy() == rows[:, 0]).all()
+
+
 @pytest.mark.parametrize("k_total", [2, 1000])
 def test_random_rows_decode_to_their_action(k_total):
     env = LayoutEnv(spaces.Tuple((spaces.Discrete(k_total), box(-1, 1, 1))))

@@ -209,14 +209,15 @@ class CHDP(HybridOffPolicyAlgorithm):
             raise ValueError(f"improvement_parameters must be one of {IMPROVEMENT_PARAMETERS}, got {improvement_parameters!r}")
         if not 0 <= uniform_fraction <= 1:
             raise ValueError(f"uniform_fraction must be between 0 and 1, got {uniform_fraction}")
-        for name, value in (
-            ("latent_dim", latent_dim),
-            ("n_action_candidates", n_action_candidates),
-            ("n_target_candidates", n_target_candidates),
-            ("policy_delay", policy_delay),
+        for name, value, least in (
+            ("latent_dim", latent_dim, 1),
+            ("n_action_candidates", n_action_candidates, 1),
+            ("n_random_candidates", n_random_candidates, 0),
+            ("n_target_candidates", n_target_candidates, 1),
+            ("policy_delay", policy_delay, 1),
         ):
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
+            if value < least:
+                raise ValueError(f"{name} must be at least {least}, got {value}")
         self.latent_dim = latent_dim
         self.n_diffusion_steps = n_diffusion_steps
         self.beta_schedule = beta_schedule
