@@ -7,6 +7,7 @@ import pytest
 import torch as th
 from torch import nn
 
+from sb3_chdp.chdp.denoising import denoise
 from sb3_chdp.chdp.diffusion import DeterministicModel, DiffusionModel, NoiseSchedule, cosine_beta_schedule
 
 
@@ -47,14 +48,14 @@ def test_bad_arguments(kwargs, message):
 
 def test_reverse_step_equals_the_papers():
     """Without clipping, the mean through x_0 is (x - (1 - alpha) / sqrt(1 - abar) eps) / sqrt(alpha)."""
-    model = DiffusionModel(4, 2, 5, [8])
-    schedule = model.schedule
+    schedule = NoiseSchedule(5)
     for i in range(5):
         noise = 0.1 * th.randn(64, 4)
         x = schedule.sqrt_alphas_cumprod[i] * (th.rand(64, 4) - 0.5) + schedule.sqrt_one_minus_alphas_cumprod[i] * noise
         alpha = 1 - schedule.betas[i]
         expected = (x - (1 - alpha) / schedule.sqrt_one_minus_alphas_cumprod[i] * noise) / alpha**0.5
-        th.testing.assert_close(model.p_mean(x, i, noise), expected, atol=2e-5, rtol=1e-4)
+        mean = denoise([schedule.steps[i]], x[None], None, lambda x, i, noise=noise: noise)
+        th.testing.assert_close(mean, expected, atol=2e-5, rtol=1e-4)
 
 
 class OptimalPredictor(th.nn.Module):
@@ -63,17 +64,12 @@ class OptimalPredictor(th.nn.Module):
     def __init__(self, schedule, mean, std):
         super().__init__()
         self.schedule, self.mean, self.std = schedule, mean, std
-        self.i = schedule.n_steps
 
-    def condition_context(self, condition):
-        return 0.0
+    def for_chain(self, condition):
+        return self
 
-    def time_context(self):
-        return th.zeros(self.schedule.n_steps)
-
-    def forward(self, x, context):
-        self.i -= 1
-        abar = self.schedule.alphas_cumprod[self.i]
+    def forward(self, x, i):
+        abar = self.schedule.alphas_cumprod[i]
         variance = abar * self.std**2 + 1 - abar
         return (1 - abar) ** 0.5 * (x - abar**0.5 * self.mean) / variance
 
@@ -152,7 +148,9 @@ def test_written_out_gradients_equal_autograd(net_arch, activation_fn, masked):
     x = noise[0]
     for i in reversed(range(6)):
         x = x if mask is None else x * mask
-        x = model.p_mean(x, i, predictor(x, context + times[i]))
+        abar, coefficients = schedule.alphas_cumprod[i], (schedule.posterior_mean_coef1[i], schedule.posterior_mean_coef2[i])
+        x_start = ((x - (1 - abar) ** 0.5 * predictor(x, context + times[i])) / abar**0.5).clamp(-1, 1)
+        x = coefficients[0] * x_start + coefficients[1] * x
         x = x + schedule.sigmas[i] * noise[i] if i > 0 else x
     plain = x.clamp(-1, 1) if mask is None else x.clamp(-1, 1) * mask
     fast = model.sample(condition, noise, mask)

@@ -8,11 +8,11 @@ def activate(activation: nn.Module, x: th.Tensor, value: th.Tensor) -> th.Tensor
     """
     :param activation: an element-wise activation function
     :param x: its input
-    :param value: where to put its value
+    :param value: where to put its value, x itself if that is not needed any more
     :return: ``value``
     """
     if isinstance(activation, nn.SiLU):
-        return th.sigmoid(x, out=value).mul_(x)
+        return th.ops.aten.silu.out(x, out=value)
     if isinstance(activation, nn.ReLU):
         return th.clamp(x, min=0, out=value)
     if isinstance(activation, nn.Tanh):

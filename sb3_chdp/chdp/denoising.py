@@ -1,10 +1,11 @@
 """
-The reverse chain of a diffusion model with its backward pass written out.
+The reverse chain of a diffusion model, in memory that every step uses again, with its backward pass written out.
 
-Autograd keeps inputs and outputs of every operation of all N steps, in fresh memory. Here only what goes into the
-activations is kept, and the rest is computed again on the way back, in memory that every step uses again.
+Fresh memory costs more than what is computed in it. Autograd keeps inputs and outputs of every operation of all N steps;
+here only what goes into the activations is kept, and the rest is computed again on the way back.
 """
 
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch as th
@@ -26,13 +27,86 @@ class StepConstants(NamedTuple):
     sigma: float
 
 
+def denoise(
+    steps: list[StepConstants],
+    noise: th.Tensor,
+    mask: th.Tensor | None,
+    predict_noise: Callable[[th.Tensor, int], th.Tensor],
+    tape: list[tuple[th.Tensor, th.Tensor]] | None = None,
+) -> th.Tensor:
+    """
+    Run the reverse chain without gradient (eq. denoising_step of the paper, through x_start, so that it can be clipped).
+
+    :param steps: constants of the N steps
+    :param noise: (N, B, dim) the start x_N and what steps 1 to N - 1 inject
+    :param mask: (B, dim) 1 for the entries that exist, None if all do
+    :param predict_noise: noise (B, dim) in x_i (B, dim) at step i
+    :param tape: list that takes x_i, and where x_start is not clipped, of every step
+    :return: (B, dim) x_0
+    """
+    x = noise[0]
+    for i in reversed(range(len(steps))):
+        step = steps[i]
+        if mask is not None:
+            x = x * mask
+        x_start = th.mul(x, step.recip).sub_(predict_noise(x, i), alpha=step.recipm1)
+        clipped = x_start.clamp(-1, 1)
+        if tape is not None:
+            tape.append((x, x_start == clipped))
+        x = clipped.mul_(step.coef_start).add_(x, alpha=step.coef_x)
+        if i > 0:
+            x.add_(noise[i], alpha=step.sigma)
+    return x
+
+
+class ChainMLP:
+    """
+    The MLP that predicts the noise in all steps of one chain, without gradient, in memory that every step uses again.
+
+    :param activation: activation function
+    :param context: (B, H) what the condition adds to the first layer
+    :param times: (N, H) what time and bias add to it
+    :param weights: weight of the first layer for x (H, dim), weights of all further layers
+    :param biases: biases of the further layers
+    :param tape: list that takes the inputs of the activations of every step, which are then not overwritten
+    """
+
+    def __init__(
+        self,
+        activation: nn.Module,
+        context: th.Tensor,
+        times: th.Tensor,
+        weights: Sequence[th.Tensor],
+        biases: Sequence[th.Tensor],
+        tape: list[list[th.Tensor]] | None = None,
+    ):
+        self.activation, self.context, self.times, self.weights, self.biases = activation, context, times, weights, biases
+        self.tape = tape
+        self.values = self._empty()
+
+    def _empty(self) -> list[th.Tensor]:
+        return [self.context.new_empty(len(self.context), weight.shape[1]) for weight in self.weights[1:]]
+
+    def __call__(self, x: th.Tensor, i: int) -> th.Tensor:
+        """:return: (B, dim) predicted noise in x (B, dim) at step i"""
+        inputs = self.values
+        if self.tape is not None:
+            inputs = self._empty()
+            self.tape.append(inputs)
+        th.add(self.context, self.times[i], out=inputs[0]).addmm_(x, self.weights[0].t())
+        for layer, (value, bias) in enumerate(zip(self.values, self.biases, strict=True), start=1):
+            activate(self.activation, inputs[layer - 1], value)
+            output = inputs[layer] if layer < len(inputs) else value.new_empty(x.shape)
+            th.addmm(bias, value, self.weights[layer].t(), out=output)
+        return output
+
+
 class DenoisingChain(th.autograd.Function):
     """
-    x_0 of a chain of N steps that an MLP with one or more hidden layers denoises.
+    :func:`denoise` with a :class:`ChainMLP`, and its gradient.
 
-    Inputs: the constants of the N steps; the activation; noise (N, B, dim), the start x_N and what steps 1 to N - 1 inject;
-    mask (B, dim) of the entries that exist, or None; context (B, H), what the condition adds to the first layer; times
-    (N, H), what time and bias add; the first layer's weight for x (H, dim); weight and bias of every further layer.
+    Inputs: the constants of the N steps; the activation; noise, mask, context and times as there; the first layer's weight
+    for x; weight and bias of every further layer.
     """
 
     @staticmethod
@@ -48,26 +122,9 @@ class DenoisingChain(th.autograd.Function):
         *layers: th.Tensor,
     ) -> th.Tensor:
         weights, biases = (x_weight, *layers[0::2]), layers[1::2]
-        values = [context.new_empty(len(context), weight.shape[1]) for weight in weights[1:]]
-        # Of every step: x_i, the inputs of the activations, and where x_start is not clipped
-        tape: list[tuple[th.Tensor, list[th.Tensor], th.Tensor]] = []
-        x = noise[0]
-        for i in reversed(range(len(steps))):
-            step = steps[i]
-            if mask is not None:
-                x = x * mask
-            hidden = [th.add(context, times[i]).addmm_(x, x_weight.t())]
-            for weight, bias, value in zip(weights[1:], biases, values, strict=True):
-                hidden.append(th.addmm(bias, activate(activation, hidden[-1], value), weight.t()))
-            x_start = th.mul(x, step.recip).sub_(hidden.pop(), alpha=step.recipm1)
-            clipped = x_start.clamp(-1, 1)
-            tape.append((x, hidden, x_start == clipped))
-            x = clipped.mul_(step.coef_start).add_(x, alpha=step.coef_x)
-            if i > 0:
-                x.add_(noise[i], alpha=step.sigma)
-        ctx.steps, ctx.activation, ctx.tape, ctx.mask = steps, activation, tape, mask
+        ctx.steps, ctx.activation, ctx.mask, ctx.tape, ctx.mlp_tape = steps, activation, mask, [], []
         ctx.save_for_backward(*weights)
-        return x
+        return denoise(steps, noise, mask, ChainMLP(activation, context, times, weights, biases, ctx.mlp_tape), ctx.tape)
 
     @staticmethod
     @once_differentiable
@@ -77,8 +134,9 @@ class DenoisingChain(th.autograd.Function):
         bias_gradients = [weight.new_zeros(len(weight)) for weight in weights[1:]]
         times_gradient = weights[0].new_zeros(len(ctx.steps), len(weights[0]))
         context_gradient = gradient.new_zeros(len(gradient), len(weights[0]))
-        value, derivative, delta_ = ([th.empty_like(h) for h in ctx.tape[0][1]] for _ in range(3))
-        for i, (step, (x, hidden, inside)) in enumerate(zip(ctx.steps, reversed(ctx.tape), strict=True)):
+        value, derivative, delta_ = ([th.empty_like(h) for h in ctx.mlp_tape[0]] for _ in range(3))
+        tapes = zip(ctx.steps, reversed(ctx.tape), reversed(ctx.mlp_tape), strict=True)
+        for i, (step, (x, inside), hidden) in enumerate(tapes):
             start_gradient = th.mul(gradient, step.coef_start).mul_(inside)
             # Gradient at the output of a layer, from the last to the first
             delta = start_gradient * -step.recipm1

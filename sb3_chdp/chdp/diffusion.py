@@ -9,7 +9,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_chdp.chdp.denoising import DenoisingChain, StepConstants
+from sb3_chdp.chdp.denoising import ChainMLP, DenoisingChain, StepConstants, denoise
 
 
 def vp_beta_schedule(n_steps: int, beta_min: float = 0.1, beta_max: float = 10.0) -> np.ndarray:
@@ -131,7 +131,8 @@ class NoisePredictor(nn.Module):
         self.time_weight = nn.Parameter(w_time.clone())
         self.condition_weight = nn.Parameter(w_condition.clone())
         self.bias = nn.Parameter(first_layer.bias.detach().clone())
-        self.trunk = nn.Sequential(activation_fn(), *create_mlp(net_arch[0], dim, net_arch[1:], activation_fn))
+        self.activation = activation_fn()
+        self.trunk = nn.Sequential(self.activation, *create_mlp(net_arch[0], dim, net_arch[1:], activation_fn))
 
     def time_context(self) -> th.Tensor:
         """:return: (N, H) contributions of the N times to the first layer"""
@@ -143,6 +144,21 @@ class NoisePredictor(nn.Module):
         :return: (B, H) its contribution to the first layer
         """
         return F.linear(condition, self.condition_weight)
+
+    def chain_inputs(self, condition: th.Tensor) -> tuple[th.Tensor, ...]:
+        """
+        :param condition: (B, condition_dim)
+        :return: contributions of condition and times to the first layer, its weight for x, and the further layers' parameters
+        """
+        return self.condition_context(condition), self.time_context(), self.x_weight, *self.trunk.parameters()
+
+    def for_chain(self, condition: th.Tensor) -> Callable[[th.Tensor, int], th.Tensor]:
+        """
+        :param condition: (B, condition_dim)
+        :return: function that predicts the noise (B, dim) in x_i (B, dim) at step i, without gradient
+        """
+        context, times, x_weight, *layers = self.chain_inputs(condition)
+        return ChainMLP(self.activation, context, times, [x_weight, *layers[0::2]], layers[1::2])
 
     def forward(self, x: th.Tensor, context: th.Tensor) -> th.Tensor:
         """
@@ -185,22 +201,6 @@ class DiffusionModel(nn.Module):
         levels = [self.schedule.sqrt_alphas_cumprod, self.schedule.sqrt_one_minus_alphas_cumprod]
         self.register_buffer("_levels", th.tensor(levels, dtype=th.float32), persistent=False)
 
-    def predict_start_from_noise(self, x: th.Tensor, i: int, noise: th.Tensor) -> th.Tensor:
-        """:return: (B, dim) the clean sample that x_i and the noise in it imply"""
-        schedule = self.schedule
-        return schedule.sqrt_recip_alphas_cumprod[i] * x - schedule.sqrt_recipm1_alphas_cumprod[i] * noise
-
-    def p_mean(self, x: th.Tensor, i: int, noise: th.Tensor) -> th.Tensor:
-        """
-        Mean of the reverse step (eq. denoising_step of the paper, written through x_0 so that x_0 can be clipped).
-
-        :param x: (B, dim) x_i
-        :param i: index of the step
-        :param noise: (B, dim) predicted noise
-        """
-        x_start = self.predict_start_from_noise(x, i, noise).clamp(-1, 1)
-        return self.schedule.posterior_mean_coef1[i] * x_start + self.schedule.posterior_mean_coef2[i] * x
-
     def draw_noise(self, n: int, generator: th.Generator | None = None) -> th.Tensor:
         """
         :param n: number of chains
@@ -223,21 +223,11 @@ class DiffusionModel(nn.Module):
         """
         if noise is None:
             noise = self.draw_noise(len(condition))
-        predictor = self.noise_predictor
-        context, times = predictor.condition_context(condition), predictor.time_context()
+        steps, predictor = self.schedule.steps, self.noise_predictor
         if th.is_grad_enabled():
-            activation, *layers = predictor.trunk
-            parameters = [p for layer in layers for p in layer.parameters()]
-            steps = self.schedule.steps
-            x = DenoisingChain.apply(steps, activation, noise, mask, context, times, predictor.x_weight, *parameters)
+            x = DenoisingChain.apply(steps, predictor.activation, noise, mask, *predictor.chain_inputs(condition))
         else:
-            x = noise[0]
-            for i in reversed(range(self.schedule.n_steps)):
-                if mask is not None:
-                    x = x * mask
-                x = self.p_mean(x, i, predictor(x, context + times[i]))
-                if i > 0:
-                    x.add_(noise[i], alpha=self.schedule.sigmas[i])
+            x = denoise(steps, noise, mask, predictor.for_chain(condition))
         x = x.clamp(-1, 1)
         return x if mask is None else x * mask
 
