@@ -7,7 +7,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chdp import CHDP
-from sb3_chdp.chdp.exploration import reflect, vary_parts
+from sb3_chdp.chdp.exploration import random_parameters, reflect, vary_parts
 from tests.algorithms import FAST_CHDP, filled_model
 from tests.hybrid_envs import box, make_layout_env
 
@@ -15,6 +15,16 @@ from tests.hybrid_envs import box, make_layout_env
 def test_reflect():
     x = np.array([-5.0, -1.25, -1.0, 0.5, 1.5, 4.0])
     np.testing.assert_allclose(reflect(x), [1.0, -0.75, -1.0, 0.5, 0.5, -1.0])
+
+
+def test_half_of_the_random_parameters_are_bounds():
+    mask = np.ones((20_000, 2))
+    mask[:, 1] = 0
+    first, padding = random_parameters(np.random.default_rng(0), mask).T
+    assert not padding.any()
+    assert (first == -1).mean() == pytest.approx(0.25, abs=0.02)
+    assert (first == 1).mean() == pytest.approx(0.25, abs=0.02)
+    assert (np.abs(first) < 0.5).mean() == pytest.approx(0.25, abs=0.02)
 
 
 def test_each_part_is_varied():

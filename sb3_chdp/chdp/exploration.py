@@ -15,6 +15,16 @@ def reflect(x: np.ndarray) -> np.ndarray:
     return np.clip(x, -1, 1)
 
 
+def random_parameters(rng: np.random.Generator, mask: np.ndarray) -> np.ndarray:
+    """
+    :param rng: random generator
+    :param mask: (n, Pmax) 1 for the parameters that exist
+    :return: (n, Pmax) scaled parameters, each a bound with probability 1/2 (where good actions often lie), else uniform in
+        between; padding 0
+    """
+    return np.clip(rng.uniform(-2, 2, mask.shape), -1, 1) * mask
+
+
 def vary_parts(
     policy: CHDPPolicy, observation: np.ndarray | dict[str, np.ndarray], rows: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
@@ -22,9 +32,10 @@ def vary_parts(
     Replace a part of each action, or all of it.
 
     With equal probability: a uniformly random discrete action with the parameters that the continuous policy draws for it;
-    the same discrete action with uniformly random parameters; the same action with Gaussian noise on its parameters, whose
-    standard deviation is log-uniform in ``NOISE_SCALES``; a uniformly random action. In a large parameter box of which a
-    small part is of use, the last alone hardly ever tries what is better than the present action.
+    the same discrete action with random parameters; the same action with Gaussian noise on its parameters, whose standard
+    deviation is log-uniform in ``NOISE_SCALES``; a uniformly random discrete action with random parameters. In a large
+    parameter box of which a small part is of use, the last alone hardly ever tries what is better than the present action.
+    Random parameters are those of :func:`random_parameters`.
 
     :param policy: the policies
     :param observation: n observations
@@ -34,7 +45,6 @@ def vary_parts(
     """
     n, spec = len(rows), policy.action_space.spec
     columns = slice(1, spec.row_size)
-    shape = rows[:, columns].shape
     kinds = rng.integers(4, size=(n, 1))
 
     random = policy.random_rows(rng, n)
@@ -46,8 +56,9 @@ def vary_parts(
 
     mask = spec.mask[rows[:, 0].astype(int)]
     elsewhere, nearby = rows.copy(), rows.copy()
-    elsewhere[:, columns] = rng.uniform(-1, 1, shape) * mask
+    random[:, columns] = random_parameters(rng, spec.mask[random[:, 0].astype(int)])
+    elsewhere[:, columns] = random_parameters(rng, mask)
     low, high = np.log(NOISE_SCALES)
     scales = np.exp(rng.uniform(low, high, (n, 1)))
-    nearby[:, columns] = reflect(rows[:, columns] + scales * rng.normal(size=shape)) * mask
+    nearby[:, columns] = reflect(rows[:, columns] + scales * rng.normal(size=mask.shape)) * mask
     return np.choose(kinds, [of_random_k, elsewhere, nearby, random])
