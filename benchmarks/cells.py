@@ -196,8 +196,8 @@ def run_cell(cell: Cell) -> str:
     cell.stem.parent.mkdir(parents=True, exist_ok=True)
     model, rows = start_model(cell)
     resumed_at = model.num_timesteps
-    model.learn(cell.total_steps - resumed_at, callback=CurveCallback(cell, rows), reset_num_timesteps=resumed_at == 0)
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
+    describe = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    commit = subprocess.run(describe, cwd=ROOT, capture_output=True, text=True).stdout.strip()
     meta = {
         **asdict(cell),
         "settings": {key: str(value) for key, value in cell.settings().items()},
@@ -207,8 +207,10 @@ def run_cell(cell: Cell) -> str:
         "machine": f"{platform.machine()}, Python {platform.python_version()}, {cell.threads} thread(s)",
     }
     del meta["out"]
+    cell.path(".started").write_text(json.dumps(meta, indent=1))
+    model.learn(cell.total_steps - resumed_at, callback=CurveCallback(cell, rows), reset_num_timesteps=resumed_at == 0)
     model.save(cell.path(".zip"))
-    cell.path(".json").write_text(json.dumps(meta, indent=1))
+    cell.path(".started").rename(cell.path(".json"))
     for suffix in (".checkpoint.zip", ".buffer.pkl"):
         cell.path(suffix).unlink(missing_ok=True)
     return f"{cell.stem}: {cell.path('.csv').read_text().splitlines()[-1]}"

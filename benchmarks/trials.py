@@ -2,10 +2,10 @@
 The log of all tuning runs, results/trials.csv: a line per run, written by reproduce.py into folders of their own.
 
     python benchmarks/reproduce.py main --algos chdp --envs Goal-v0 --seeds 0 --set gamma=0.9 --out /tmp/tune/goal-gamma
-    python benchmarks/trials.py /tmp/tune            add what is complete below /tmp/tune
+    python benchmarks/trials.py /tmp/tune            add what is below /tmp/tune
 
 A line holds the folder's name as the name of the trial, what the run changed of its YAML file as it was at that commit, and
-the scores as in the tables: means over the last five evaluations.
+the scores as in the tables: means over the last five evaluations. Runs that were stopped early count, with a mark.
 """
 
 import argparse
@@ -20,16 +20,18 @@ LOG = RESULTS / "trials.csv"
 
 
 def read_trials(folder: Path) -> pd.DataFrame:
-    """:return: a line per complete run below the folder"""
+    """:return: a line per run below the folder"""
     lines = []
-    for meta_path in sorted(folder.glob("*/*/*/*/seed_*.json")):
+    for meta_path in sorted([*folder.glob("*/*/*/*/seed_*.json"), *folder.glob("*/*/*/*/seed_*.started")]):
         meta = json.loads(meta_path.read_text())
         curve = pd.read_csv(meta_path.with_suffix(".csv"))
+        if curve.empty:
+            continue
         last = curve.tail(LAST_EVALUATIONS)
         lines.append(
             {
                 "trial": meta_path.relative_to(folder).parts[0],
-                "commit": meta["commit"][:7],
+                "commit": meta["commit"][:7] + ("-dirty" if meta["commit"].endswith("-dirty") else ""),
                 "algorithm": meta["algo"],
                 "environment": meta["env_id"],
                 "seed": meta["seed"],
@@ -40,6 +42,7 @@ def read_trials(folder: Path) -> pd.DataFrame:
                 "success": round(100 * last["success"].mean(), 1),
                 "best_success": round(100 * curve["success"].max(), 1),
                 "return": round(last["return"].mean(), 3),
+                "stopped": meta_path.suffix == ".started",
             }
         )
     return pd.DataFrame(lines)

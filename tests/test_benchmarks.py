@@ -52,6 +52,8 @@ def test_a_killed_run_goes_on(algo, tmp_path, monkeypatch):
     with pytest.raises(KilledError):
         cells.run_cell(cell)
     assert not cell.is_complete and len(cell.rows()) == 2
+    log = trials.read_trials(tmp_path.parent)
+    assert log.loc[log["trial"] == tmp_path.name, "stopped"].tolist() == [True]
     before = cell.path(".csv").read_text()
     cells.run_cell(cell)
     assert cell.is_complete and cell.path(".csv").read_text().startswith(before)
@@ -89,7 +91,7 @@ def test_log_of_trials(tmp_path):
     cells.run_cell(make_cell(tmp_path / "smaller", "hppo"))
     log = trials.read_trials(tmp_path)
     assert len(log) == 1 and log.iloc[0]["trial"] == "smaller" and "n_steps=10" in log.iloc[0]["changes"]
-    assert log.iloc[0]["timesteps"] == 240
+    assert log.iloc[0]["timesteps"] == 240 and not log.iloc[0]["stopped"]
 
 
 @pytest.mark.parametrize("algo", ["chdp", "hyar_td3"])
