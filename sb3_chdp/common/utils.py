@@ -31,21 +31,25 @@ def nearest_row(points: th.Tensor, table: th.Tensor) -> th.Tensor:
     :param table: (K, d)
     :return: (B,) index of the row of the table that is nearest in Euclidean distance
     """
-    # |p - t|^2 without |p|^2, which is the same for all rows, as one product: (p, 1) (-2 t, |t|^2)
+    # |p - t|^2 without |p|^2, which is the same for all rows, as one product: (-2 t, |t|^2) (p, 1)
+    n_rows, dim = table.shape
+    is_large = n_rows > NEAREST_ROW_CHUNK
+    padding = -n_rows % NEAREST_ROW_GROUP if is_large else 0
+    rows = table.new_zeros(n_rows + padding, dim + 1)
+    th.mul(table, -2, out=rows[:n_rows, :dim])
+    rows[:n_rows, dim] = th.linalg.vecdot(table, table)
     points = F.pad(points, (0, 1), value=1.0)
-    rows = th.cat([-2 * table, table.square().sum(dim=1, keepdim=True)], dim=1)
-    if len(rows) <= NEAREST_ROW_CHUNK:
+    if not is_large:
         return th.mm(points, rows.t()).min(dim=1).indices
     # The distances to all rows of a large table do not fit into the processor's cache, and the place of a minimum takes
     # longer to find than its value: first the nearest group of rows, chunk by chunk, then the row within the group
-    padding = -len(rows) % NEAREST_ROW_GROUP
-    rows = th.cat([rows, F.pad(rows.new_zeros(padding, rows.shape[1] - 1), (0, 1), value=th.inf)])
+    rows[n_rows:, dim] = th.inf
+    columns = points.t().contiguous()
     of_groups = [
-        th.mm(points, chunk.t()).view(len(points), -1, NEAREST_ROW_GROUP).amin(dim=2)
-        for chunk in rows.split(NEAREST_ROW_CHUNK)
+        th.mm(chunk, columns).view(-1, NEAREST_ROW_GROUP, len(points)).amin(dim=1) for chunk in rows.split(NEAREST_ROW_CHUNK)
     ]
-    group = th.cat(of_groups, dim=1).argmin(dim=1)
-    candidates = rows.view(-1, NEAREST_ROW_GROUP, rows.shape[1])[group]
+    group = th.cat(of_groups).min(dim=0).indices
+    candidates = rows.view(-1, NEAREST_ROW_GROUP, dim + 1)[group]
     return group * NEAREST_ROW_GROUP + th.bmm(candidates, points[:, :, None]).squeeze(2).argmin(dim=1)
 
 
