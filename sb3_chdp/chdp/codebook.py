@@ -25,7 +25,7 @@ class Codebook(nn.Module):
         :param latents: (B, d_e)
         :return: (B,) index k of the nearest codeword in squared Euclidean distance
         """
-        return nearest_row(latents.detach(), self.codewords.detach())
+        return nearest_row(latents, self.codewords)
 
     def forward(self, k: th.Tensor) -> th.Tensor:
         """

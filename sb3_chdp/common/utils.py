@@ -25,6 +25,7 @@ def polyak_update(params: Iterable[th.Tensor], target_params: Iterable[th.Tensor
         th._foreach_lerp_(list(target_params), list(params), tau)
 
 
+@th.no_grad()
 def nearest_row(points: th.Tensor, table: th.Tensor) -> th.Tensor:
     """
     :param points: (B, d)
