@@ -153,10 +153,12 @@ def matrix_products(repeats: int) -> Iterator[str]:
         model.train(2, batch_size)
         with profile(activities=[ProfilerActivity.CPU], record_shapes=True) as record:
             model.train(1, batch_size)
+        # Where an operation has its two factors; what comes after them is where the product is put
+        first = {"aten::mm": 0, "aten::addmm": 1, "aten::addmm_": 1}
         shapes = [
-            [tuple(shape) for shape in event.input_shapes if len(shape) == 2][-2:]
+            tuple(tuple(shape) for shape in event.input_shapes[first[event.name] :][:2])
             for event in record.events()
-            if event.name in ("aten::addmm", "aten::mm", "aten::addmm_")
+            if event.name in first
         ]
         pairs = {(a, b): (th.randn(a), th.randn(b)) for a, b in shapes}
         products = [pairs[a, b] for a, b in shapes]
