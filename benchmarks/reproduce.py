@@ -15,6 +15,7 @@ belong in another --out. ``python benchmarks/tables.py`` makes tables and figure
 import argparse
 import multiprocessing
 import os
+import signal
 import time
 from pathlib import Path
 
@@ -119,6 +120,8 @@ def main() -> None:
     os.environ["OMP_NUM_THREADS"] = str(args.threads)  # of the worker processes
     cells = make_cells(args)
     started = time.time()
+    # To be killed ends the workers too, as Ctrl-C does
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     with (
         multiprocessing.get_context("spawn").Pool(args.jobs, maxtasksperchild=1) as pool,
         Live(overview(cells, started), refresh_per_second=1) as live,
