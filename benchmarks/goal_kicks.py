@@ -1,8 +1,8 @@
 """
-What a published model knows about the first kick on Goal or Hard Goal, by the height of the start.
+What a model of CHDP knows about the first kick on Goal or Hard Goal, by the height of the start.
 
-    python benchmarks/goal_kicks.py                       Hard Goal
-    python benchmarks/goal_kicks.py --env Goal-v0
+    python benchmarks/goal_kicks.py                       the published model of Hard Goal
+    python benchmarks/goal_kicks.py --env Goal-v0 --model benchmarks/results/main/chdp/Goal-v0/seed_12.zip
 
 Prints success and length of episodes, and for kicks to (v, v) two values that agree if the critics have learnt: Q of the kick,
 and the discounted value of what follows it, by the same critics.
@@ -44,8 +44,9 @@ def kick_values(model: CHDP, obs: np.ndarray, kicks: np.ndarray) -> np.ndarray:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="HardGoal-v0", choices=["Goal-v0", "HardGoal-v0"])
+    parser.add_argument("--model", help="zip of a trained model (default: the published one)")
     args = parser.parse_args()
-    model = CHDP.load(ROOT / "models" / "chdp" / f"{args.env}_1" / f"{args.env}.zip", device="cpu")
+    model = CHDP.load(args.model or ROOT / "models" / "chdp" / f"{args.env}_1" / f"{args.env}.zip", device="cpu")
     env = gym.make(args.env).unwrapped
     env.reset(seed=0)
     kick = [space.sample() for space in env.action_space[1]]

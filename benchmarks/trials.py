@@ -1,8 +1,8 @@
 """
 The log of all tuning runs, results/trials.csv: a line per run, written by reproduce.py into folders of their own.
 
-    python benchmarks/reproduce.py main --algos chdp --envs Goal-v0 --seeds 0 --set gamma=0.9 --out /tmp/tune/goal-gamma
-    python benchmarks/trials.py /tmp/tune            add what is below /tmp/tune
+    python benchmarks/reproduce.py main --algos chdp --envs Goal-v0 --seeds 0 --set gamma=0.9 --out ~/tune/goal-gamma
+    python benchmarks/trials.py ~/tune                add what is below ~/tune
 
 A line holds the folder's name as the name of the trial, what the run changed of its YAML file as it was at that commit, and
 the scores as in the tables: means over the last five evaluations. Runs that were stopped early count, with a mark.
