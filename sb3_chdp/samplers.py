@@ -96,7 +96,8 @@ def convert_chdp_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     for name in ("batch_size", "latent_dim", "gradient_steps", "n_target_candidates"):
         hyperparams[name] = 2 ** hyperparams.pop(f"{name}_pow")
     net_arch = NET_ARCHS[hyperparams.pop("net_arch")]
-    hyperparams["policy_kwargs"] = {"net_arch": net_arch, "layer_norm": hyperparams.pop("layer_norm")}
+    critic_kwargs = {name: hyperparams.pop(name) for name in ("layer_norm", "parameter_degree")}
+    hyperparams["policy_kwargs"] = {"net_arch": net_arch, **critic_kwargs}
     return hyperparams
 
 
@@ -122,9 +123,10 @@ def sample_chdp_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
         "latent_dim_pow": trial.suggest_int("latent_dim_pow", 1, 5),
         # From 1 to 2**3=8
         "n_target_candidates_pow": trial.suggest_int("n_target_candidates_pow", 0, 3),
-        "uniform_fraction": trial.suggest_categorical("uniform_fraction", [0.0, 0.25, 0.5]),
+        "uniform_fraction": trial.suggest_categorical("uniform_fraction", [0.0, 0.25, 0.5, 0.75]),
         "explore_parts": trial.suggest_categorical("explore_parts", [False, True]),
         "layer_norm": trial.suggest_categorical("layer_norm", [False, True]),
+        "parameter_degree": trial.suggest_categorical("parameter_degree", [1, 4]),
         "tau": trial.suggest_float("tau", 0.001, 0.05, log=True),
         "eta": trial.suggest_float("eta", 1.0, 30.0, log=True),
         "n_diffusion_steps": trial.suggest_int("n_diffusion_steps", 5, 15, step=5),

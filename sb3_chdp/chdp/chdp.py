@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
 
 from sb3_chdp.chdp.actor import CooperativeActor
+from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.exploration import vary_parts
 from sb3_chdp.chdp.losses import (
     IMPROVEMENT_PARAMETERS,
@@ -23,7 +24,6 @@ from sb3_chdp.chdp.losses import (
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
-from sb3_chdp.common.policies import HybridCritic
 from sb3_chdp.common.utils import polyak_update
 
 SelfCHDP = TypeVar("SelfCHDP", bound="CHDP")

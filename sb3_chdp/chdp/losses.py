@@ -3,8 +3,8 @@
 import torch as th
 from torch.nn import functional as F
 
+from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.policies import CHDPPolicy
-from sb3_chdp.common.policies import HybridCritic
 from sb3_chdp.common.type_aliases import HybridReplaySamples
 
 IMPROVEMENT_QS = ("q1", "min", "mean")
@@ -131,6 +131,6 @@ def q_to_ascend(
 ) -> th.Tensor:
     """:return: (B, 1) the Q that the policies ascend; gradient flows to the action only"""
     if improvement_q == "q1":
-        return critic.q_networks[0](th.cat([critic_features, latents, parameters], dim=1))
+        return critic.q1_values(critic_features, latents, parameters)
     q1, q2 = critic.q_values(critic_features, latents, parameters)
     return th.min(q1, q2) if improvement_q == "min" else 0.5 * (q1 + q2)

@@ -17,9 +17,10 @@ from torch import nn
 
 from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.codebook import Codebook, OneHotCodebook
+from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.diffusion import DeterministicModel, DiffusionModel
 from sb3_chdp.common.hybrid_box import HybridBox
-from sb3_chdp.common.policies import CnnFeatures, CombinedFeatures, HybridCritic, HybridPolicy
+from sb3_chdp.common.policies import CnnFeatures, CombinedFeatures, HybridPolicy
 from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.common.utils import hash_observations
 
@@ -50,6 +51,8 @@ class CHDPPolicy(HybridPolicy):
         critic's loss alone; otherwise they have their own, which learns from the loss of the discrete policy
     :param layer_norm: whether the critics have layer normalisation, see :class:`HybridCritic`; it steadies and speeds up
         learning with few discrete actions, and slows it down with many
+    :param parameter_degree: highest degree of the Chebyshev polynomials of the parameters that the critics see (1: the
+        parameters as they are); 4 tells apart parameters that differ by a hundredth of their range
     :param diffusion: whether the policies are diffusion models (False: deterministic MLPs)
     :param codebook: whether discrete actions are represented by codewords (False: one-hot vectors)
     :param n_diffusion_steps: number N of denoising steps
@@ -79,6 +82,7 @@ class CHDPPolicy(HybridPolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = False,
         layer_norm: bool = False,
+        parameter_degree: int = 1,
         diffusion: bool = True,
         codebook: bool = True,
         n_diffusion_steps: int = 15,
@@ -106,6 +110,7 @@ class CHDPPolicy(HybridPolicy):
         self.activation_fn = activation_fn
         self.share_features_extractor = share_features_extractor
         self.layer_norm = layer_norm
+        self.parameter_degree = parameter_degree
         self.diffusion = diffusion
         self.use_codebook = codebook
         self.n_diffusion_steps = n_diffusion_steps
@@ -126,13 +131,15 @@ class CHDPPolicy(HybridPolicy):
         features_dim = critic_extractor.features_dim
         self.critic = HybridCritic(
             self.observation_space,
-            latent_dim + spec.max_parameters,
+            latent_dim,
+            spec.max_parameters,
             critic_arch,
             critic_extractor,
             features_dim,
             self.activation_fn,
             self.normalize_images,
             self.layer_norm,
+            self.parameter_degree,
         )
         k_total = spec.n_discrete_actions
         codebook = Codebook(k_total, latent_dim) if self.use_codebook else OneHotCodebook(k_total)
@@ -310,6 +317,7 @@ class CHDPPolicy(HybridPolicy):
                 optimizer_kwargs=self.optimizer_kwargs,
                 share_features_extractor=self.share_features_extractor,
                 layer_norm=self.layer_norm,
+                parameter_degree=self.parameter_degree,
                 diffusion=self.diffusion,
                 codebook=self.use_codebook,
                 n_diffusion_steps=self.n_diffusion_steps,

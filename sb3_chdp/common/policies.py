@@ -4,11 +4,8 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor, NatureCNN, create_mlp
-from stable_baselines3.common.type_aliases import PyTorchObs
-from torch import nn
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
 
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.utils import check_finite
@@ -108,62 +105,3 @@ class CombinedFeatures(HybridPolicy):
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **{"features_extractor_class": CombinedExtractor, **kwargs})
-
-
-class HybridCritic(ContinuousCritic):
-    """
-    SB3's twin critic Q(s, latent, parameters), with the features of the state computed once for several calls.
-
-    :param observation_space: observation space
-    :param action_dim: width of the concatenated action input
-    :param net_arch: hidden layers
-    :param features_extractor: network to extract features
-    :param features_dim: number of features
-    :param activation_fn: activation function
-    :param normalize_images: whether to divide images by 255
-    :param layer_norm: whether every hidden layer is followed by layer normalisation, which bounds Q where there is no data
-        (Ball et al., 2023)
-    """
-
-    def __init__(
-        self,
-        observation_space: spaces.Space,
-        action_dim: int,
-        net_arch: list[int],
-        features_extractor: BaseFeaturesExtractor,
-        features_dim: int,
-        activation_fn: type[nn.Module] = nn.ReLU,
-        normalize_images: bool = True,
-        layer_norm: bool = False,
-    ):
-        super().__init__(
-            observation_space,
-            spaces.Box(-np.inf, np.inf, (action_dim,)),
-            net_arch,
-            features_extractor,
-            features_dim,
-            activation_fn=activation_fn,
-            normalize_images=normalize_images,
-            n_critics=2,
-            share_features_extractor=False,
-        )
-        if layer_norm:
-            for i in range(self.n_critics):
-                modules: list[type[nn.Module]] = [nn.LayerNorm]
-                q_net = create_mlp(features_dim + action_dim, 1, net_arch, activation_fn, post_linear_modules=modules)
-                self.q_networks[i] = nn.Sequential(*q_net)
-                self.add_module(f"qf{i}", self.q_networks[i])
-
-    def features(self, obs: PyTorchObs) -> th.Tensor:
-        """:return: (B, features_dim) features of the observations"""
-        return self.extract_features(obs, self.features_extractor)
-
-    def q_values(self, features: th.Tensor, *actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """
-        :param features: (B, features_dim) from :meth:`features`
-        :param actions: the parts of the action input, each (B, n)
-        :return: Q1 and Q2, each (B, 1)
-        """
-        q_input = th.cat([features, *actions], dim=1)
-        q1, q2 = (q_net(q_input) for q_net in self.q_networks)
-        return q1, q2
