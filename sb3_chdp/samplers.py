@@ -121,8 +121,8 @@ def sample_chdp_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
         "gradient_steps_pow": trial.suggest_int("gradient_steps_pow", 0, 3),
         # From 2 to 2**5=32
         "latent_dim_pow": trial.suggest_int("latent_dim_pow", 1, 5),
-        # From 1 to 2**3=8
-        "n_target_candidates_pow": trial.suggest_int("n_target_candidates_pow", 0, 3),
+        # From 1 to 2**4=16
+        "n_target_candidates_pow": trial.suggest_int("n_target_candidates_pow", 0, 4),
         "uniform_fraction": trial.suggest_categorical("uniform_fraction", [0.0, 0.25, 0.5, 0.75]),
         "explore_parts": trial.suggest_categorical("explore_parts", [False, True]),
         "layer_norm": trial.suggest_categorical("layer_norm", [False, True]),
