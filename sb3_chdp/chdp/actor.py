@@ -80,14 +80,14 @@ class CooperativeActor(BaseModel):
         condition = th.cat([features, self.codebook(k)], dim=1)
         return self.continuous_policy.sample(condition, noise, self.mask(k))
 
-    def random_actions(self, n: int) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+    def random_actions(self, *shape: int) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """
         Uniformly random actions.
 
-        :param n: number of actions
-        :return: codewords as latents (n, latent_dim), discrete actions (n, 1), parameters (n, Pmax), padding 0
+        :param shape: how many actions
+        :return: codewords as latents (*shape, latent_dim), discrete actions (*shape), parameters (*shape, Pmax), padding 0
         """
-        k = th.randint(self.codebook.n_discrete_actions, (n,), device=self.device)
-        parameters = 2 * th.rand(n, self.continuous_policy.dim, device=self.device) - 1
+        k = th.randint(self.codebook.n_discrete_actions, shape, device=self.device)
+        parameters = 2 * th.rand(*shape, self.continuous_policy.dim, device=self.device) - 1
         mask = self.mask(k)
-        return self.codebook.representative_latents(k), k[:, None], parameters if mask is None else parameters * mask
+        return self.codebook.representative_latents(k), k, parameters if mask is None else parameters * mask

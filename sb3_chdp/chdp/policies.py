@@ -212,41 +212,39 @@ class CHDPPolicy(HybridPolicy):
         :param actor: the policies
         :param features: (B, features_dim) features for the policies
         :param critic_features: (B, features_dim) features for the target critics
-        :param n_candidates: number of actions drawn per row, a share ``uniform_fraction`` of them, rounded up, with random k
+        :param n_candidates: number of actions drawn per row, a share ``uniform_fraction`` of them, rounded up, with random k,
+            but never all
         :param hashes: (B,) numbers that decide the noise of the row; random noise if None
         :param n_random: number of uniformly random actions per row that compete with those
         :return: latents (B, latent_dim), discrete actions (B,), parameters (B, Pmax) and their min(Q1, Q2) (B, 1)
         """
         batch_size, device = features.shape[0], features.device
+        n_uniform = min(math.ceil(self.uniform_fraction * n_candidates), n_candidates - 1)
         noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None)
         if hashes is not None:
-            chains = (hashes[:, None] + th.arange(n_candidates, device=device)).flatten() % FIXED_NOISE_CHAINS
-            noise = (self.fixed_latent_noise[..., chains, :], self.fixed_parameter_noise[..., chains, :])
-        n_total = n_candidates + n_random
-        if n_total > 1:
-            features = features.repeat_interleave(n_candidates, dim=0)
-            critic_features = critic_features.repeat_interleave(n_total, dim=0)
-        latents, k = actor.sample_latents(features, noise[0])
-        n_uniform = math.ceil(self.uniform_fraction * n_candidates) if n_candidates > 1 else 0
+            chains = (hashes[:, None] + th.arange(n_candidates, device=device)) % FIXED_NOISE_CHAINS
+            noise = (
+                self.fixed_latent_noise[..., chains[:, n_uniform:].flatten(), :],
+                self.fixed_parameter_noise[..., chains.flatten(), :],
+            )
+        latents, k = actor.sample_latents(features.repeat_interleave(n_candidates - n_uniform, dim=0), noise[0])
+        latents, k = latents.view(batch_size, n_candidates - n_uniform, -1), k.view(batch_size, -1)
         if n_uniform > 0:
             if hashes is None:
                 hashes = th.randint(2**31, (batch_size,), device=device)
             # Successive actions: all of them if there are no more than candidates
-            k_total = actor.codebook.n_discrete_actions
-            k.view(batch_size, -1)[:, :n_uniform] = (hashes[:, None] + th.arange(n_uniform, device=device)) % k_total
-            uniform = th.arange(len(k), device=device) % n_candidates < n_uniform
-            latents[uniform] = actor.codebook.representative_latents(k[uniform])
-        parameters = actor.sample_parameters(features, k, noise[1])
+            uniform_k = (hashes[:, None] + th.arange(n_uniform, device=device)) % actor.codebook.n_discrete_actions
+            latents = th.cat([actor.codebook.representative_latents(uniform_k), latents], dim=1)
+            k = th.cat([uniform_k, k], dim=1)
+        parameters = actor.sample_parameters(features.repeat_interleave(n_candidates, dim=0), k.flatten(), noise[1])
+        parameters = parameters.view(batch_size, n_candidates, -1)
         if n_random > 0:
-            drawn, random = (latents, k[:, None], parameters), actor.random_actions(batch_size * n_random)
-            latents, k, parameters = (
-                th.cat([a.view(batch_size, n_candidates, -1), b.view(batch_size, n_random, -1)], dim=1).flatten(0, 1)
-                for a, b in zip(drawn, random, strict=True)
-            )
-            k = k[:, 0]
+            drawn, random = (latents, k, parameters), actor.random_actions(batch_size, n_random)
+            latents, k, parameters = (th.cat(pair, dim=1) for pair in zip(drawn, random, strict=True))
+        latents, k, parameters = (part.flatten(0, 1) for part in (latents, k, parameters))
+        n_total = n_candidates + n_random
+        critic_features = critic_features.repeat_interleave(n_total, dim=0)
         q_values = th.min(*self.critic_target.q_values(critic_features, latents, parameters))
-        if n_total == 1:
-            return latents, k, parameters, q_values
         best = q_values.view(batch_size, n_total).argmax(dim=1) + th.arange(batch_size, device=device) * n_total
         return latents[best], k[best], parameters[best], q_values[best]
 
