@@ -17,7 +17,7 @@ from cells import ROOT
 
 from sb3_chdp import CHDP
 
-KICKS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0)
+KICKS = (0.0, 0.5, 1.0, 2.0, 4.0, 6.0)
 N_STARTS, N_KICKS = 20, 12
 
 
