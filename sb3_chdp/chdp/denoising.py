@@ -18,11 +18,12 @@ from sb3_chdp.chdp.activations import activate, activate_with_derivative
 class StepConstants(NamedTuple):
     """
     Constants of one denoising step: x_start = clip(recip x - recipm1 noise), next x = coef_start x_start + coef_x x + sigma z.
+    Factors are tensors () on the CPU: a product with a number makes one each time.
     """
 
-    recip: float
+    recip: th.Tensor
     recipm1: float
-    coef_start: float
+    coef_start: th.Tensor
     coef_x: float
     sigma: float
 
@@ -41,10 +42,10 @@ def denoise(
     :param noise: (N, B, dim) the start x_N and what steps 1 to N - 1 inject
     :param mask: (B, dim) 1 for the entries that exist, None if all do
     :param predict_noise: noise (B, dim) in x_i (B, dim) at step i
-    :param tape: list that takes x_i, and where x_start is not clipped, of every step
+    :param tape: list that takes x_i, and x_start before it is clipped, of every step
     :return: (B, dim) x_0
     """
-    x = noise[0]
+    x, *injected = noise.unbind()
     for i in reversed(range(len(steps))):
         step = steps[i]
         if mask is not None:
@@ -52,10 +53,10 @@ def denoise(
         x_start = th.mul(x, step.recip).sub_(predict_noise(x, i), alpha=step.recipm1)
         clipped = x_start.clamp(-1, 1)
         if tape is not None:
-            tape.append((x, x_start == clipped))
+            tape.append((x, x_start))
         x = clipped.mul_(step.coef_start).add_(x, alpha=step.coef_x)
         if i > 0:
-            x.add_(noise[i], alpha=step.sigma)
+            x.add_(injected[i - 1], alpha=step.sigma)
     return x
 
 
@@ -80,8 +81,8 @@ class ChainMLP:
         biases: Sequence[th.Tensor],
         tape: list[list[th.Tensor]] | None = None,
     ):
-        self.activation, self.context, self.times, self.weights, self.biases = activation, context, times, weights, biases
-        self.tape = tape
+        self.activation, self.context, self.weights, self.biases, self.tape = activation, context, weights, biases, tape
+        self.times, self.transposed = times.unbind(), [weight.t() for weight in weights]
         self.values = self._empty()
 
     def _empty(self) -> list[th.Tensor]:
@@ -93,11 +94,11 @@ class ChainMLP:
         if self.tape is not None:
             inputs = self._empty()
             self.tape.append(inputs)
-        th.add(self.context, self.times[i], out=inputs[0]).addmm_(x, self.weights[0].t())
+        th.add(self.context, self.times[i], out=inputs[0]).addmm_(x, self.transposed[0])
         for layer, (value, bias) in enumerate(zip(self.values, self.biases, strict=True), start=1):
             activate(self.activation, inputs[layer - 1], value)
             output = inputs[layer] if layer < len(inputs) else value.new_empty(x.shape)
-            th.addmm(bias, value, self.weights[layer].t(), out=output)
+            th.addmm(bias, value, self.transposed[layer], out=output)
         return output
 
 
@@ -131,26 +132,26 @@ class DenoisingChain(th.autograd.Function):
     def backward(ctx: Any, gradient: th.Tensor) -> tuple[th.Tensor | None, ...]:  # type: ignore[override]
         weights = ctx.saved_tensors
         weight_gradients = [th.zeros_like(weight) for weight in weights]
-        bias_gradients = [weight.new_zeros(len(weight)) for weight in weights[1:]]
-        times_gradient = weights[0].new_zeros(len(ctx.steps), len(weights[0]))
+        # Of the biases of all layers at every time; the first layer's are the times' own
+        bias_gradients = [weight.new_empty(len(ctx.steps), len(weight)) for weight in weights]
         context_gradient = gradient.new_zeros(len(gradient), len(weights[0]))
         value, derivative, delta_ = ([th.empty_like(h) for h in ctx.mlp_tape[0]] for _ in range(3))
         tapes = zip(ctx.steps, reversed(ctx.tape), reversed(ctx.mlp_tape), strict=True)
-        for i, (step, (x, inside), hidden) in enumerate(tapes):
-            start_gradient = th.mul(gradient, step.coef_start).mul_(inside)
+        for i, (step, (x, x_start), hidden) in enumerate(tapes):
+            start_gradient = th.ops.aten.hardtanh_backward(th.mul(gradient, step.coef_start), x_start, -1, 1)
             # Gradient at the output of a layer, from the last to the first
             delta = start_gradient * -step.recipm1
             for layer in range(len(weights) - 1, 0, -1):
                 below = layer - 1
                 activate_with_derivative(ctx.activation, hidden[below], value[below], derivative[below])
                 weight_gradients[layer].addmm_(delta.t(), value[below])
-                bias_gradients[below].add_(delta.sum(dim=0))
+                th.sum(delta, dim=0, out=bias_gradients[layer][i])
                 delta = th.mm(delta, weights[layer], out=delta_[below]).mul_(derivative[below])
             weight_gradients[0].addmm_(delta.t(), x)
-            times_gradient[i] = delta.sum(dim=0)
+            th.sum(delta, dim=0, out=bias_gradients[0][i])
             context_gradient.add_(delta)
-            gradient = th.mul(gradient, step.coef_x).add_(start_gradient, alpha=step.recip).addmm_(delta, weights[0])
+            gradient = th.mul(start_gradient, step.recip).add_(gradient, alpha=step.coef_x).addmm_(delta, weights[0])
             if ctx.mask is not None:
                 gradient.mul_(ctx.mask)
-        layers = [g for pair in zip(weight_gradients[1:], bias_gradients, strict=True) for g in pair]
-        return None, None, None, None, context_gradient, times_gradient, weight_gradients[0], *layers
+        layers = [g for w, b in zip(weight_gradients[1:], bias_gradients[1:], strict=True) for g in (w, b.sum(dim=0))]
+        return None, None, None, None, context_gradient, bias_gradients[0], weight_gradients[0], *layers

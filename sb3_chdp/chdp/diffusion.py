@@ -80,8 +80,8 @@ class NoiseSchedule:
         variance = betas if variance_type == "fixed_large" else posterior_variance
         self.sigmas: list[float] = np.sqrt(variance).tolist()
         self.steps = [
-            StepConstants(*constants)
-            for constants in zip(
+            StepConstants(th.tensor(recip), recipm1, th.tensor(coef_start), coef_x, sigma)
+            for recip, recipm1, coef_start, coef_x, sigma in zip(
                 self.sqrt_recip_alphas_cumprod,
                 self.sqrt_recipm1_alphas_cumprod,
                 self.posterior_mean_coef1,
