@@ -10,8 +10,9 @@ from sb3_chdp.common.td3 import InvertingGradients
 from tests.hybrid_envs import make_layout_env
 
 SMALL = dict(
-    batch_size=16, learning_starts=10**9, buffer_size=500, seed=0, learning_rate=1e-3, policy_kwargs=dict(net_arch=[16])
-)
+    batch_size=16, learning_starts=10**9, buffer_size=500, seed=0, learning_rate=1e-3,
+    policy_kwargs=dict(net_arch=[16], optimizer_kwargs=dict(fused=True)),
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("layout", ["nested", "shared"])

@@ -22,7 +22,7 @@ from sb3_chdp.chdp.diffusion import DeterministicModel, DiffusionModel
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.policies import CnnFeatures, CombinedFeatures, HybridPolicy
 from sb3_chdp.common.spaces import HybridActionSpec
-from sb3_chdp.common.utils import hash_observations
+from sb3_chdp.common.utils import default_optimizer_kwargs, hash_observations
 
 # Spread of the latents around a codeword in random actions
 RANDOM_LATENT_NOISE = 0.1
@@ -94,8 +94,7 @@ class CHDPPolicy(HybridPolicy):
         exploration_noise: float = 0.1,
     ):
         if optimizer_kwargs is None:
-            # One kernel per step instead of a loop over parameters
-            optimizer_kwargs = {"fused": True} if optimizer_class == th.optim.Adam else {}
+            optimizer_kwargs = default_optimizer_kwargs(optimizer_class)
         super().__init__(
             observation_space,
             action_space,

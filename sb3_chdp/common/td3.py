@@ -15,6 +15,7 @@ from torch import nn
 from sb3_chdp.common.hybrid_box import HybridBox, ScoreBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.policies import HybridPolicy
+from sb3_chdp.common.utils import default_optimizer_kwargs
 
 SelfHybridTD3 = TypeVar("SelfHybridTD3", bound="HybridTD3")
 
@@ -47,13 +48,16 @@ class HybridTD3Policy(HybridPolicy, TD3Policy):
     """
     SB3's TD3 policy on the rows of a hybrid action space.
 
-    All arguments but one are those of :class:`stable_baselines3.td3.policies.TD3Policy`.
+    Arguments not listed here are those of :class:`stable_baselines3.td3.policies.TD3Policy`.
 
+    :param optimizer_kwargs: keyword arguments of the optimizers, without the learning rate; ``fused=True`` for Adam if None
     :param inverting_gradients: whether to invert the gradients at the actor's output
     """
 
     def __init__(self, *args: Any, inverting_gradients: bool = False, **kwargs: Any):
         self.inverting_gradients = inverting_gradients
+        if kwargs.get("optimizer_kwargs") is None:
+            kwargs["optimizer_kwargs"] = default_optimizer_kwargs(kwargs.get("optimizer_class", th.optim.Adam))
         super().__init__(*args, **kwargs)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:

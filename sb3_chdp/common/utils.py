@@ -25,6 +25,11 @@ def polyak_update(params: Iterable[th.Tensor], target_params: Iterable[th.Tensor
         th._foreach_lerp_(list(target_params), list(params), tau)
 
 
+def default_optimizer_kwargs(optimizer_class: type[th.optim.Optimizer]) -> dict[str, Any]:
+    """:return: ``fused=True`` for Adam: one kernel per step instead of a loop over parameters"""
+    return {"fused": True} if optimizer_class == th.optim.Adam else {}
+
+
 @th.no_grad()
 def nearest_row(points: th.Tensor, table: th.Tensor) -> th.Tensor:
     """
