@@ -19,6 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from cells import RESULTS, ROOT
+from matplotlib.ticker import NullFormatter
 from rliable import library, metrics
 
 from sb3_chdp.envs import ENV_IDS
@@ -178,6 +179,7 @@ def plot_curves(runs: pd.DataFrame) -> None:
         if axis.lines:
             # Budgets differ by a factor of 17
             axis.set_xscale("log")
+            axis.xaxis.set_minor_formatter(NullFormatter())
             axis.legend(fontsize=8)
     for axis in axes[:, 0]:
         axis.set_ylabel("success, %")
