@@ -52,7 +52,7 @@ class CHDPPolicy(HybridPolicy):
     :param layer_norm: whether the critics have layer normalisation, see :class:`HybridCritic`; it steadies and speeds up
         learning with few discrete actions, and slows it down with many
     :param parameter_degree: highest degree of the Chebyshev polynomials of the parameters that the critics see (1: the
-        parameters as they are); 4 tells apart parameters that differ by a hundredth of their range
+        parameters as they are), see :func:`chebyshev_features`
     :param diffusion: whether the policies are diffusion models (False: deterministic MLPs)
     :param codebook: whether discrete actions are represented by codewords (False: one-hot vectors)
     :param n_diffusion_steps: number N of denoising steps
