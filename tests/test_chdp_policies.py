@@ -153,9 +153,10 @@ def test_the_best_candidate_acts(uniform_fraction, deterministic):
     assert uniform_fraction == 0 or (covered == 2).all()
 
 
-def test_random_candidates_find_what_the_policies_miss():
-    """With a critic that values parameters near 0.7 alone, rollouts get there and deterministic predictions do not."""
-    model = filled_model(n_action_candidates=1, n_random_candidates=64)
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_random_candidates_find_what_the_policies_miss(deterministic):
+    """With a critic that values parameters near 0.7 alone, and policies that never draw such."""
+    model = filled_model(n_action_candidates=1)
     with th.no_grad():
         for parameter in model.actor_target.continuous_policy.parameters():
             parameter.zero_()
@@ -167,10 +168,14 @@ def test_random_candidates_find_what_the_policies_miss():
 
     model.critic_target.q_values = q_values
     obs = np.random.uniform(-1, 1, (50, 4)).astype(np.float32)
-    error = {d: np.abs(model.policy.predict_rows(obs, d)[:, 1] - 0.7).mean() for d in (False, True)}
-    assert error[False] < 0.1 < error[True]
-    rows = model.policy.predict_rows(obs)
-    assert (model.actor.codebook.quantize(th.as_tensor(rows[:, 2:])).numpy() == rows[:, 0]).all()
+    errors = []
+    for model.policy.n_random_candidates in (0, 64):
+        rows = model.policy.predict_rows(obs, deterministic)
+        errors.append(np.abs(rows[:, 1] - 0.7).mean())
+        assert (model.actor.codebook.quantize(th.as_tensor(rows[:, 2:])).numpy() == rows[:, 0]).all()
+        again = model.policy.predict_rows(obs, deterministic)
+        assert (rows == again).all() == deterministic
+    assert errors[1] < 0.1 < errors[0]
 
 
 @pytest.mark.parametrize("k_total", [2, 1000])

@@ -80,14 +80,16 @@ class CooperativeActor(BaseModel):
         condition = th.cat([features, self.codebook(k)], dim=1)
         return self.continuous_policy.sample(condition, noise, self.mask(k))
 
-    def random_actions(self, *shape: int) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+    def random_actions(self, *shape: int, generator: th.Generator | None = None) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """
         Uniformly random actions.
 
         :param shape: how many actions
+        :param generator: random generator on the CPU, the global one of the model's device if None
         :return: codewords as latents (*shape, latent_dim), discrete actions (*shape), parameters (*shape, Pmax), padding 0
         """
-        k = th.randint(self.codebook.n_discrete_actions, shape, device=self.device)
-        parameters = 2 * th.rand(*shape, self.continuous_policy.dim, device=self.device) - 1
+        device = self.device if generator is None else "cpu"
+        k = th.randint(self.codebook.n_discrete_actions, shape, generator=generator, device=device).to(self.device)
+        parameters = 2 * th.rand(*shape, self.continuous_policy.dim, generator=generator, device=device).to(self.device) - 1
         mask = self.mask(k)
         return self.codebook.representative_latents(k), k, parameters if mask is None else parameters * mask

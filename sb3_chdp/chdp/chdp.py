@@ -82,8 +82,8 @@ class CHDP(HybridOffPolicyAlgorithm):
         for, and among the candidates
     :param n_action_candidates: number of actions drawn per observation when acting; the one with the highest min(Q1, Q2)
         of the target critics is taken
-    :param n_random_candidates: number of uniformly random actions that compete with these in rollouts: a search for what the
-        critics value and the policies have not found; best with ``layer_norm`` of :class:`CHDPPolicy` (0: the paper)
+    :param n_random_candidates: number of uniformly random actions that compete with these: a search for what the critics value
+        and the policies have not found; best with ``layer_norm`` of :class:`CHDPPolicy` (0: the paper)
     :param n_target_candidates: number of next actions drawn per transition for the target of the critics, chosen from in
         the same way (1: the paper)
     :param relabel_latents: whether a stored latent that does not decode to the stored discrete action any more is

@@ -60,7 +60,7 @@ class CHDPPolicy(HybridPolicy):
     :param variance_type: see :class:`NoiseSchedule`
     :param n_action_candidates: number of actions drawn per observation, of which the one with the highest min(Q1, Q2) of
         the target critics acts
-    :param n_random_candidates: number of uniformly random actions that compete with these, unless deterministic
+    :param n_random_candidates: number of uniformly random actions that compete with these
     :param uniform_fraction: share of the drawn candidates whose discrete action is uniformly random
     :param exploration_noise: standard deviation of the exploration noise of policies without diffusion
     """
@@ -213,12 +213,14 @@ class CHDPPolicy(HybridPolicy):
         :param critic_features: (B, features_dim) features for the target critics
         :param n_candidates: number of actions drawn per row, a share ``uniform_fraction`` of them, rounded up, with random k,
             but never all
-        :param hashes: (B,) numbers that decide the noise of the row; random noise if None
+        :param hashes: (B,) numbers that decide the noise of the row, and then all rows have the same random actions; both are
+            random if None
         :param n_random: number of uniformly random actions per row that compete with those
         :return: latents (B, latent_dim), discrete actions (B,), parameters (B, Pmax) and their min(Q1, Q2) (B, 1)
         """
         batch_size, device = features.shape[0], features.device
         n_uniform = min(math.ceil(self.uniform_fraction * n_candidates), n_candidates - 1)
+        fixed = hashes is not None
         noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None)
         if hashes is not None:
             chains = (hashes[:, None] + th.arange(n_candidates, device=device)) % FIXED_NOISE_CHAINS
@@ -238,8 +240,14 @@ class CHDPPolicy(HybridPolicy):
         parameters = actor.sample_parameters(features.repeat_interleave(n_candidates, dim=0), k.flatten(), noise[1])
         parameters = parameters.view(batch_size, n_candidates, -1)
         if n_random > 0:
-            drawn, random = (latents, k, parameters), actor.random_actions(batch_size, n_random)
-            latents, k, parameters = (th.cat(pair, dim=1) for pair in zip(drawn, random, strict=True))
+            if fixed:
+                random = actor.random_actions(1, n_random, generator=th.Generator().manual_seed(0))
+            else:
+                random = actor.random_actions(batch_size, n_random)
+            latents, k, parameters = (
+                th.cat([drawn, part.expand(batch_size, *part.shape[1:])], dim=1)
+                for drawn, part in zip((latents, k, parameters), random, strict=True)
+            )
         latents, k, parameters = (part.flatten(0, 1) for part in (latents, k, parameters))
         n_total = n_candidates + n_random
         critic_features = critic_features.repeat_interleave(n_total, dim=0)
@@ -249,8 +257,8 @@ class CHDPPolicy(HybridPolicy):
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """
-        Draw ``n_action_candidates`` actions per observation and keep the one of highest target min(Q1, Q2). Predictions that
-        are not deterministic choose from ``n_random_candidates`` uniformly random actions as well.
+        Draw ``n_action_candidates`` actions per observation and keep the one of highest target min(Q1, Q2), or one of
+        ``n_random_candidates`` uniformly random actions if its value is higher.
 
         Deterministic predictions take their noise from a fixed store, at a place that depends on the observation: one and
         the same noise in all states would repeat a policy's mistakes where sampling gets away from them. They use the
@@ -267,7 +275,7 @@ class CHDPPolicy(HybridPolicy):
             critic_features,
             self.n_action_candidates,
             hashes,
-            0 if deterministic else self.n_random_candidates,
+            self.n_random_candidates,
         )
         return th.cat([k[:, None].float(), parameters, latents], dim=1)
 
