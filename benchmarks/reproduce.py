@@ -35,7 +35,7 @@ PAPER_DEFAULTS = {
     "improvement_parameters": "stored",
     "uniform_fraction": 0.0,
     "n_target_candidates": 1,
-    "policy_kwargs": {"layer_norm": False, "parameter_degree": 1},
+    "policy_kwargs": {"layer_norm": False, "parameter_degree": 1, "bilinear": False},
 }
 ABLATION = {
     "full": {},

@@ -96,7 +96,7 @@ def convert_chdp_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     for name in ("batch_size", "latent_dim", "gradient_steps", "n_target_candidates"):
         hyperparams[name] = 2 ** hyperparams.pop(f"{name}_pow")
     net_arch = NET_ARCHS[hyperparams.pop("net_arch")]
-    critic_kwargs = {name: hyperparams.pop(name) for name in ("layer_norm", "parameter_degree")}
+    critic_kwargs = {name: hyperparams.pop(name) for name in ("layer_norm", "parameter_degree", "bilinear")}
     hyperparams["policy_kwargs"] = {"net_arch": net_arch, **critic_kwargs}
     return hyperparams
 
@@ -127,6 +127,7 @@ def sample_chdp_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
         "explore_parts": trial.suggest_categorical("explore_parts", [False, True]),
         "layer_norm": trial.suggest_categorical("layer_norm", [False, True]),
         "parameter_degree": trial.suggest_categorical("parameter_degree", [1, 4]),
+        "bilinear": trial.suggest_categorical("bilinear", [False, True]),
         "tau": trial.suggest_float("tau", 0.001, 0.05, log=True),
         "eta": trial.suggest_float("eta", 1.0, 30.0, log=True),
         "n_diffusion_steps": trial.suggest_int("n_diffusion_steps", 5, 15, step=5),

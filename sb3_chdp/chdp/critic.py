@@ -40,6 +40,8 @@ class HybridCritic(ContinuousCritic):
         (Ball et al., 2023)
     :param parameter_degree: highest degree of the Chebyshev polynomials of the parameters that the networks see, see
         :func:`chebyshev_features`
+    :param bilinear: whether the networks see the products of all entries of the latent with all parameters as well: what a
+        parameter does depends on the discrete action, often by a factor
     :raises ValueError: if ``parameter_degree`` is less than 1
     """
 
@@ -55,10 +57,11 @@ class HybridCritic(ContinuousCritic):
         normalize_images: bool = True,
         layer_norm: bool = False,
         parameter_degree: int = 1,
+        bilinear: bool = False,
     ):
         if parameter_degree < 1:
             raise ValueError(f"parameter_degree must be at least 1, got {parameter_degree}")
-        action_dim = latent_dim + n_parameters * parameter_degree
+        action_dim = latent_dim + n_parameters * (parameter_degree + latent_dim * bilinear)
         super().__init__(
             observation_space,
             spaces.Box(-np.inf, np.inf, (action_dim,)),
@@ -71,6 +74,7 @@ class HybridCritic(ContinuousCritic):
             share_features_extractor=False,
         )
         self.parameter_degree = parameter_degree
+        self.bilinear = bilinear
         if layer_norm:
             for i in range(self.n_critics):
                 modules: list[type[nn.Module]] = [nn.LayerNorm]
@@ -83,7 +87,10 @@ class HybridCritic(ContinuousCritic):
         return self.extract_features(obs, self.features_extractor)
 
     def _q_input(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-        return th.cat([features, latents, chebyshev_features(parameters, self.parameter_degree)], dim=1)
+        parts = [features, latents, chebyshev_features(parameters, self.parameter_degree)]
+        if self.bilinear:
+            parts.append((latents[:, :, None] * parameters[:, None, :]).flatten(1))
+        return th.cat(parts, dim=1)
 
     def q_values(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """

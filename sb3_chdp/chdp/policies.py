@@ -53,6 +53,7 @@ class CHDPPolicy(HybridPolicy):
         learning with few discrete actions, and slows it down with many
     :param parameter_degree: highest degree of the Chebyshev polynomials of the parameters that the critics see (1: the
         parameters as they are), see :func:`chebyshev_features`
+    :param bilinear: whether the critics see the products of latent and parameters as well, see :class:`HybridCritic`
     :param diffusion: whether the policies are diffusion models (False: deterministic MLPs)
     :param codebook: whether discrete actions are represented by codewords (False: one-hot vectors)
     :param n_diffusion_steps: number N of denoising steps
@@ -83,6 +84,7 @@ class CHDPPolicy(HybridPolicy):
         share_features_extractor: bool = False,
         layer_norm: bool = False,
         parameter_degree: int = 1,
+        bilinear: bool = False,
         diffusion: bool = True,
         codebook: bool = True,
         n_diffusion_steps: int = 15,
@@ -110,6 +112,7 @@ class CHDPPolicy(HybridPolicy):
         self.share_features_extractor = share_features_extractor
         self.layer_norm = layer_norm
         self.parameter_degree = parameter_degree
+        self.bilinear = bilinear
         self.diffusion = diffusion
         self.use_codebook = codebook
         self.n_diffusion_steps = n_diffusion_steps
@@ -139,6 +142,7 @@ class CHDPPolicy(HybridPolicy):
             self.normalize_images,
             self.layer_norm,
             self.parameter_degree,
+            self.bilinear,
         )
         k_total = spec.n_discrete_actions
         codebook = Codebook(k_total, latent_dim) if self.use_codebook else OneHotCodebook(k_total)
@@ -323,6 +327,7 @@ class CHDPPolicy(HybridPolicy):
                 share_features_extractor=self.share_features_extractor,
                 layer_norm=self.layer_norm,
                 parameter_degree=self.parameter_degree,
+                bilinear=self.bilinear,
                 diffusion=self.diffusion,
                 codebook=self.use_codebook,
                 n_diffusion_steps=self.n_diffusion_steps,
