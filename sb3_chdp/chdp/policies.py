@@ -1,6 +1,5 @@
 """Networks of CHDP: a discrete and a continuous diffusion policy, their codebook, the twin critic and all targets."""
 
-import math
 from copy import deepcopy
 from typing import Any
 
@@ -16,6 +15,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_chdp.chdp.actor import CooperativeActor
+from sb3_chdp.chdp.candidates import FIXED_NOISE_CHAINS, policy_candidates, random_candidates
 from sb3_chdp.chdp.codebook import Codebook, OneHotCodebook
 from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.diffusion import DeterministicModel, DiffusionModel
@@ -26,8 +26,6 @@ from sb3_chdp.common.utils import default_optimizer_kwargs, hash_observations
 
 # Spread of the latents around a codeword in random actions
 RANDOM_LATENT_NOISE = 0.1
-# Number of noise chains that deterministic predictions choose from
-FIXED_NOISE_CHAINS = 1024
 
 
 class CHDPPolicy(HybridPolicy):
@@ -206,8 +204,8 @@ class CHDPPolicy(HybridPolicy):
         features: th.Tensor,
         critic_features: th.Tensor,
         n_candidates: int,
-        hashes: th.Tensor | None = None,
         n_random: int = 0,
+        hashes: th.Tensor | None = None,
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
         """
         Draw actions and keep the one of highest min(Q1, Q2) of the target critics.
@@ -215,49 +213,16 @@ class CHDPPolicy(HybridPolicy):
         :param actor: the policies
         :param features: (B, features_dim) features for the policies
         :param critic_features: (B, features_dim) features for the target critics
-        :param n_candidates: number of actions drawn per row, a share ``uniform_fraction`` of them, rounded up, with random k,
-            but never all
-        :param hashes: (B,) numbers that decide the noise of the row, and then all rows have the same random actions; both are
-            random if None
+        :param n_candidates: number of actions that the policies draw per row, see :func:`policy_candidates`
         :param n_random: number of uniformly random actions per row that compete with those
+        :param hashes: (B,) numbers that decide all that is random; None: draw
         :return: latents (B, latent_dim), discrete actions (B,), parameters (B, Pmax) and their min(Q1, Q2) (B, 1)
         """
-        batch_size, device = features.shape[0], features.device
-        n_uniform = min(math.ceil(self.uniform_fraction * n_candidates), n_candidates - 1)
-        fixed = hashes is not None
-        noise: tuple[th.Tensor | None, th.Tensor | None] = (None, None)
-        if hashes is not None:
-            chains = (hashes[:, None] + th.arange(n_candidates, device=device)) % FIXED_NOISE_CHAINS
-            noise = (
-                self.fixed_latent_noise[..., chains[:, n_uniform:].flatten(), :],
-                self.fixed_parameter_noise[..., chains.flatten(), :],
-            )
-        latents, k = actor.sample_latents(features.repeat_interleave(n_candidates - n_uniform, dim=0), noise[0])
-        latents, k = latents.view(batch_size, n_candidates - n_uniform, -1), k.view(batch_size, -1)
-        if n_uniform > 0:
-            if hashes is None:
-                hashes = th.randint(2**31, (batch_size,), device=device)
-            # Successive actions: all of them if there are no more than candidates
-            uniform_k = (hashes[:, None] + th.arange(n_uniform, device=device)) % actor.codebook.n_discrete_actions
-            latents = th.cat([actor.codebook.representative_latents(uniform_k), latents], dim=1)
-            k = th.cat([uniform_k, k], dim=1)
-        parameters = actor.sample_parameters(features.repeat_interleave(n_candidates, dim=0), k.flatten(), noise[1])
-        parameters = parameters.view(batch_size, n_candidates, -1)
+        noise = (self.fixed_latent_noise, self.fixed_parameter_noise)
+        candidates = policy_candidates(actor, features, n_candidates, self.uniform_fraction, hashes, noise)
         if n_random > 0:
-            if fixed:
-                random = actor.random_actions(1, n_random, generator=th.Generator().manual_seed(0))
-            else:
-                random = actor.random_actions(batch_size, n_random)
-            latents, k, parameters = (
-                th.cat([drawn, part.expand(batch_size, *part.shape[1:])], dim=1)
-                for drawn, part in zip((latents, k, parameters), random, strict=True)
-            )
-        latents, k, parameters = (part.flatten(0, 1) for part in (latents, k, parameters))
-        n_total = n_candidates + n_random
-        critic_features = critic_features.repeat_interleave(n_total, dim=0)
-        q_values = th.min(*self.critic_target.q_values(critic_features, latents, parameters))
-        best = q_values.view(batch_size, n_total).argmax(dim=1) + th.arange(batch_size, device=device) * n_total
-        return latents[best], k[best], parameters[best], q_values[best]
+            candidates = candidates.join(random_candidates(actor, len(features), n_random, repeatable=hashes is not None))
+        return candidates.best(self.critic_target, critic_features)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """
@@ -278,8 +243,8 @@ class CHDPPolicy(HybridPolicy):
             features,
             critic_features,
             self.n_action_candidates,
-            hashes,
             self.n_random_candidates,
+            hashes,
         )
         return th.cat([k[:, None].float(), parameters, latents], dim=1)
 
