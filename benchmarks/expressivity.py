@@ -102,17 +102,16 @@ def plot_codebook(codewords: np.ndarray) -> None:
 
 def main() -> None:
     chdp = load_model("chdp")
-    n_candidates = chdp.policy.n_action_candidates
-    draws = {}
-    for n in (1, n_candidates):
-        chdp.policy.n_action_candidates = n
-        draws[NAMES["chdp"] + (f", best of {n}" if n > 1 else "")] = draw_actions(chdp)
+    name, policy = NAMES["chdp"], chdp.policy
+    draws = {f"{name}, as it acts": draw_actions(chdp)}
+    policy.n_action_candidates, policy.n_random_candidates = 1, 0
+    draws = {name: draw_actions(chdp), **draws}
     draws[NAMES["hyar_td3"]] = draw_actions(load_model("hyar_td3"))
     text = markdown(draws)
     print(text)
     replace_section(README, "expressivity", text)
     plot_draws(draws)
-    plot_codebook(chdp.policy.actor.codebook.codewords.detach().numpy())
+    plot_codebook(policy.actor.codebook.codewords.detach().numpy())
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 What a model of CHDP knows about the first kick on Goal or Hard Goal, by the height of the start.
 
     python benchmarks/goal_kicks.py                       the published model of Hard Goal
-    python benchmarks/goal_kicks.py --env Goal-v0 --model benchmarks/results/main/chdp/Goal-v0/seed_40.zip
+    python benchmarks/goal_kicks.py --env Goal-v0 --model benchmarks/results/main/chdp/Goal-v0/seed_60.zip
 
 Prints success and length of episodes, and for kicks to (v, v) two values that agree if the critics have learnt: Q of the kick,
 and the discounted value of what follows it, by the same critics.
@@ -22,11 +22,12 @@ N_STARTS, N_KICKS = 20, 12
 
 
 def state_values(model: CHDP, obs: np.ndarray) -> np.ndarray:
-    """:return: (n,) values of n observations: min(Q1, Q2) of the target critics for the best of the drawn actions"""
+    """:return: (n,) values of n observations: min(Q1, Q2) of the target critics for the best of the candidates"""
     policy, obs_tensor = model.policy, th.as_tensor(obs)
     with th.no_grad():
         features, critic_features = policy.actor_target.features(obs_tensor), policy.critic_target.features(obs_tensor)
-        *_, values = policy.best_candidate(policy.actor_target, features, critic_features, model.n_action_candidates)
+        n_candidates = (policy.n_action_candidates, policy.n_random_candidates)
+        *_, values = policy.best_candidate(policy.actor_target, features, critic_features, *n_candidates)
     return values.numpy().ravel()
 
 
