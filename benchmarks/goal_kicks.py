@@ -4,7 +4,7 @@ What a model of CHDP knows about the first kick on Goal or Hard Goal, by the hei
     python benchmarks/goal_kicks.py                       the published model of Hard Goal
     python benchmarks/goal_kicks.py --env Goal-v0 --model benchmarks/results/main/chdp/Goal-v0/seed_60.zip
 
-Prints success and length of episodes, and for kicks to (v, v) two values that agree if the critics have learnt: Q of the kick,
+Prints success and length of episodes, and for kicks to (v, 0) two values that agree if the critics have learnt: Q of the kick,
 and the discounted value of what follows it, by the same critics.
 """
 
