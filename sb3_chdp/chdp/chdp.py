@@ -1,13 +1,13 @@
 """Cooperative Hybrid Diffusion Policies."""
 
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
 
 from sb3_chdp.chdp.actor import CooperativeActor
@@ -25,8 +25,6 @@ from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputP
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.utils import polyak_update
-
-SelfCHDP = TypeVar("SelfCHDP", bound="CHDP")
 
 
 class CHDP(HybridOffPolicyAlgorithm):
@@ -368,24 +366,6 @@ class CHDP(HybridOffPolicyAlgorithm):
         perplexity = (-(frequencies * frequencies.log()).sum()).exp()
         self.logger.record("train/codebook_usage", len(frequencies) / self.hybrid_space.spec.n_discrete_actions)
         self.logger.record("train/codebook_perplexity", perplexity.item())
-
-    def learn(
-        self: SelfCHDP,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str = "CHDP",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfCHDP:
-        return super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
 
     def _excluded_save_params(self) -> list[str]:
         networks = ["actor", "critic", "actor_target", "critic_target"]

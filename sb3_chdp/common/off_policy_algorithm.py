@@ -1,19 +1,21 @@
 """What SB3's OffPolicyAlgorithm needs to work with the user's own hybrid action space."""
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.policies import HybridPolicy
 from sb3_chdp.common.type_aliases import HybridReplaySamples, name_columns
 from sb3_chdp.common.utils import check_finite
+
+SelfHybridOffPolicyAlgorithm = TypeVar("SelfHybridOffPolicyAlgorithm", bound="HybridOffPolicyAlgorithm")
 
 
 class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
@@ -100,6 +102,25 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
     def _exploration_schedule(self, initial: float, final: float) -> Schedule:
         """:return: linear schedule that ends after ``exploration_fraction`` of the training"""
         return LinearSchedule(initial, final, max(self.exploration_fraction, 1e-9))  # it divides by the fraction
+
+    def learn(
+        self: SelfHybridOffPolicyAlgorithm,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfHybridOffPolicyAlgorithm:
+        """SB3's ``learn``; the name of the tensorboard log is by default that of the class."""
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name or type(self).__name__,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
 
     def _sample_action(  # type: ignore[override]  # a list of native actions
         self,

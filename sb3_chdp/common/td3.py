@@ -1,13 +1,13 @@
 """What the baselines share that are SB3's TD3 on scores and parameters, answering in native actions."""
 
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorchObs, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 from stable_baselines3.td3 import TD3
 from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
@@ -16,8 +16,6 @@ from sb3_chdp.common.hybrid_box import HybridBox, ScoreBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.policies import HybridPolicy
 from sb3_chdp.common.utils import default_optimizer_kwargs
-
-SelfHybridTD3 = TypeVar("SelfHybridTD3", bound="HybridTD3")
 
 
 class _InvertGradient(th.autograd.Function):
@@ -190,21 +188,3 @@ class HybridTD3(HybridOffPolicyAlgorithm, TD3):
         initial = self.exploration_noise if self.exploration_initial_noise is None else self.exploration_initial_noise
         self.exploration_noise_schedule = self._exploration_schedule(initial, self.exploration_noise)
         super()._setup_model()
-
-    def learn(
-        self: SelfHybridTD3,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str | None = None,
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfHybridTD3:
-        return super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,
-            tb_log_name=tb_log_name or type(self).__name__,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
