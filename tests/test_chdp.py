@@ -56,10 +56,10 @@ def all_losses(model):
     }
 
 
-# Which networks each loss can reach. The critic is reached by the improvement losses as well, but no optimizer that
-# steps on them holds its parameters (test_each_step_moves_its_own_networks_only)
+# Which networks each loss can reach. The critic is reached by the improvement losses as well, and the codebook by the
+# critics' loss, but no optimizer that steps on them holds these parameters (test_each_step_moves_its_own_networks_only)
 GRADIENTS = {
-    "critic": {"critic"},
+    "critic": {"critic", "codebook"},
     "discrete diffusion": {"discrete"},
     "discrete improvement": {"discrete", "critic"},
     "continuous diffusion": {"continuous"},
@@ -82,8 +82,9 @@ def test_codebook_gradient_comes_through_the_continuous_chain_only():
     assert "codebook" not in networks_with_gradient(model, all_losses(model)["continuous improvement"])
 
 
-def test_each_step_moves_its_own_networks_only():
-    model = filled_model()
+@pytest.mark.parametrize("critics_train_codebook", [False, True])
+def test_each_step_moves_its_own_networks_only(critics_train_codebook):
+    model = filled_model(critics_train_codebook=critics_train_codebook)
     policy, moved = model.policy, []
     original = model._optimize
 
@@ -95,8 +96,23 @@ def test_each_step_moves_its_own_networks_only():
 
     model._optimize = spy
     model.train(1, 32)
-    assert moved == [{"critic"}, {"discrete"}, {"continuous", "codebook"}]
+    first = {"critic", "codebook"} if critics_train_codebook else {"critic"}
+    assert moved == [first, {"discrete"}, {"continuous", "codebook"}]
     assert policy.codebook_optimizer is not None
+
+
+@pytest.mark.parametrize("critics_train_codebook", [False, True])
+def test_critics_bring_codewords_of_similar_actions_together(critics_train_codebook):
+    """Of 16 actions the odd ones earn 1, the even ones -1: the critics move the two groups of codewords apart."""
+    env = LayoutEnv(spaces.Tuple((spaces.Discrete(16), box(-1, 1, 1))))
+    model = filled_model(env, gamma=0.0, codebook_lr_factor=10.0, critics_train_codebook=critics_train_codebook)
+    buffer = model.replay_buffer
+    buffer.rewards[:] = 2 * (buffer.actions[:, :, 0] % 2) - 1
+    model.train(300, 32)
+    even, odd = (model.actor.codebook.codewords.detach()[i::2] for i in (0, 1))
+    distance = (odd.mean(dim=0) - even.mean(dim=0)).norm()
+    spread = odd.std(dim=0).norm() + even.std(dim=0).norm()
+    assert (distance > spread) == critics_train_codebook
 
 
 def test_continuous_step_sees_the_updated_discrete_policy(monkeypatch):
@@ -268,7 +284,7 @@ def test_two_seeded_runs_are_identical():
                dict(variance_type="fixed_small", beta_schedule="cosine"), dict(n_action_candidates=1),
                dict(improvement_parameters="stored", uniform_fraction=0), dict(n_target_candidates=4, n_random_candidates=4),
                dict(max_grad_norm=None), dict(policy_kwargs=dict(layer_norm=True, parameter_degree=3, bilinear=True)),
-               dict(codebook_lr_factor=1.0), dict(n_diffusion_steps=1)],
+               dict(codebook_lr_factor=1.0, critics_train_codebook=True), dict(n_diffusion_steps=1)],
     ids=str,
 )  # fmt: skip
 def test_ablations_and_options_run(kwargs, tmp_path):

@@ -47,7 +47,9 @@ class CHDP(HybridOffPolicyAlgorithm):
            candidates, see ``uniform_fraction`` (0: the paper);
         5. latents from the buffer that no longer decode to the action taken are replaced, see ``relabel_latents``;
         6. gradient norms are clipped, see ``max_grad_norm``;
-        7. codewords are kept in [-1, 1], where the latents are (not an argument: without it they drift away, and latents
+        7. the critics' loss can train the codebook, which makes many discrete actions learnable, see
+           ``critics_train_codebook`` (False: the paper);
+        8. codewords are kept in [-1, 1], where the latents are (not an argument: without it they drift away, and latents
            can no longer reach them).
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
@@ -88,6 +90,8 @@ class CHDP(HybridOffPolicyAlgorithm):
         replaced by that action's present codeword
     :param codebook_lr_factor: learning rate of the codebook relative to that of the networks; the faster it moves, the
         more stored latents decode to other actions (``train/latent_drift``)
+    :param critics_train_codebook: whether the critics' loss trains the codebook too, so that actions of similar effect get
+        similar codewords; best with ``codebook_lr_factor=1`` (no effect without a codebook)
     :param max_grad_norm: bound on the gradient norm of every network, None for none
     :param policy_delay: policies and targets are updated once every ``policy_delay`` critic updates
     :param diffusion: False replaces both diffusion policies by deterministic MLPs (ablation)
@@ -155,6 +159,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         n_target_candidates: int = 1,
         relabel_latents: bool = True,
         codebook_lr_factor: float = 0.1,
+        critics_train_codebook: bool = False,
         max_grad_norm: float | None = 1.0,
         policy_delay: int = 1,
         diffusion: bool = True,
@@ -229,6 +234,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         self.n_target_candidates = n_target_candidates
         self.relabel_latents = relabel_latents
         self.codebook_lr_factor = codebook_lr_factor
+        self.critics_train_codebook = critics_train_codebook
         self.max_grad_norm = max_grad_norm
         self.policy_delay = policy_delay
         self.diffusion = diffusion
@@ -286,9 +292,10 @@ class CHDP(HybridOffPolicyAlgorithm):
             self._n_updates += 1
             replay_data, drift = relabel_latents(policy, self._sample_batch(batch_size), self.relabel_latents)
 
-            # Step 0: critics
+            # Step 0: critics, and the codebook if they train it
             loss, q_values = critic_loss(policy, replay_data, self.n_target_candidates)
-            self._optimize(loss, policy.critic.optimizer)
+            self._optimize(loss, policy.critic.optimizer, policy.codebook_optimizer if self.critics_train_codebook else None)
+            self.actor.codebook.project()
             losses = {"critic_loss": loss, "q_mean": q_values.mean(), "latent_drift": drift}
 
             if self._n_updates % self.policy_delay == 0:

@@ -32,7 +32,7 @@ def relabel_latents(
 
 def critic_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, n_target_candidates: int) -> tuple[th.Tensor, th.Tensor]:
     """
-    Mean squared Bellman errors (eq. CHDP_critic_loss_overview).
+    Mean squared Bellman errors (eq. CHDP_critic_loss_overview), of which the codebook may take a gradient as well.
 
     :param policy: the networks
     :param replay_data: a batch
@@ -47,7 +47,10 @@ def critic_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, n_target_c
         *_, next_q_values = policy.best_candidate(actor_target, next_features, next_critic_features, n_target_candidates)
         target_q_values = replay_data.rewards + (1 - replay_data.dones) * replay_data.discounts * next_q_values
     features = critic.features(replay_data.observations)
-    q1, q2 = critic.q_values(features, replay_data.latents, replay_data.parameters)
+    # The gradient with respect to a latent is also that of its codeword, as if the one moved with the other
+    codewords = policy.actor.codebook(replay_data.discrete_actions)
+    latents = replay_data.latents + (codewords - codewords.detach())
+    q1, q2 = critic.q_values(features, latents, replay_data.parameters)
     return F.mse_loss(q1, target_q_values) + F.mse_loss(q2, target_q_values), q1.detach()
 
 
