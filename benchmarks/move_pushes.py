@@ -5,8 +5,9 @@ What a model of CHDP knows about the pushes of Hard Move: far targets are reache
     python benchmarks/move_pushes.py --envs HardMove6-v0 --model benchmarks/results/main/chdp/HardMove6-v0/seed_30.zip
 
 Prints success by the distance of the target; for all pushes at full strength, forwards and backwards, the rank correlation of
-their Q with their component towards the target; and that component for the pushes that the model takes on its way to targets
-more than 1.5 away (1: the longest push, exactly towards it).
+their Q with their component towards the target; that component for the pushes that the model takes on its way to targets
+more than 1.5 away (1: the longest push, exactly towards it); and how much of the variance of the pushes is a linear function
+of the codewords (of random ones: latent_dim / K).
 """
 
 import argparse
@@ -35,6 +36,17 @@ def push_values(model: CHDP, obs: np.ndarray) -> np.ndarray:
     with th.no_grad():
         features = critic.features(th.as_tensor(obs)[None]).expand(2 * n_actions, -1)
         return th.min(*critic.q_values(features, codebook.representative_latents(k), strengths)).numpy().ravel()
+
+
+def codebook_order(model: CHDP, motions: np.ndarray) -> float:
+    """
+    :param motions: (K, 2) pushes of the discrete actions
+    :return: share of their variance that a linear function of the codewords explains
+    """
+    codewords = model.actor_target.codebook.codewords.detach().numpy()
+    inputs = np.column_stack([codewords, np.ones(len(codewords))])
+    weights = np.linalg.lstsq(inputs, motions, rcond=None)[0]
+    return 1 - float(np.square(motions - inputs @ weights).sum() / np.square(motions - motions.mean(axis=0)).sum())
 
 
 def run(model: CHDP, env_id: str, episodes: int) -> tuple[list[tuple[float, bool]], list[float], list[float]]:
@@ -68,8 +80,8 @@ def main() -> None:
     args = parser.parse_args()
     bins = list(pairwise(DISTANCES))
     print("| environment | random candidates | " + " | ".join(f"success, {a:g} to {b:g} away" for a, b in bins), end=" ")
-    print("| correlation of Q | component of pushes |")
-    print("|---|---|" + "---|" * len(bins) + "---|---|")
+    print("| correlation of Q | component of pushes | order of codewords |")
+    print("|---|---|" + "---|" * len(bins) + "---|---|---|")
     for env_id in args.envs:
         path = args.model or ROOT / "models" / "chdp" / f"{env_id}_1" / f"{env_id}.zip"
         model = CHDP.load(path, device="cpu")
@@ -78,7 +90,8 @@ def main() -> None:
         results, correlations, components = run(model, env_id, args.episodes)
         distances, successes = (np.array(values) for values in zip(*results, strict=True))
         rates = [f"{100 * successes[(a <= distances) & (distances < b)].mean():.0f} %" for a, b in bins]
-        measures = f"{np.mean(correlations):.2f} | {np.mean(components):.2f}"
+        order = codebook_order(model, motion_table(gym.make(env_id).unwrapped.n_actuators))
+        measures = f"{np.mean(correlations):.2f} | {np.mean(components):.2f} | {order:.2f}"
         print(f"| {env_id} | {model.policy.n_random_candidates} | {' | '.join(rates)} | {measures} |", flush=True)
 
 
