@@ -76,8 +76,7 @@ def plot_draws(draws: dict[str, pd.DataFrame]) -> None:
 
 def plot_codebook(codewords: np.ndarray) -> None:
     """
-    The codewords on their two main axes, coloured by the axis along which the action moves the agent: a negative strength
-    moves it backwards.
+    The codewords on their two main axes, coloured by the direction in which the action moves the agent at strength 1.
 
     :param codewords: (64, d_e)
     """
@@ -88,12 +87,12 @@ def plot_codebook(codewords: np.ndarray) -> None:
     figure, axis = plt.subplots(figsize=(6, 5))
     lengths = np.linalg.norm(MOTIONS, axis=1)
     moves = lengths > 1e-6
-    angles = np.degrees(np.arctan2(MOTIONS[:, 1], MOTIONS[:, 0])) % 180
+    angles = np.degrees(np.arctan2(MOTIONS[:, 1], MOTIONS[:, 0])) % 360
     picture = axis.scatter(
-        *points[moves].T, c=angles[moves], s=160 * lengths[moves], cmap="hsv", vmin=0, vmax=180, edgecolors="black"
+        *points[moves].T, c=angles[moves], s=160 * lengths[moves], cmap="hsv", vmin=0, vmax=360, edgecolors="black"
     )
     axis.scatter(*points[~moves].T, marker="x", color="black", label="no motion")
-    figure.colorbar(picture, label="direction of the motion modulo 180 degrees (size: length)")
+    figure.colorbar(picture, label="direction of the motion, degrees (size: length)")
     axis.set(xlabel=f"first axis ({shares[0]:.0f} % of the variance)", ylabel=f"second axis ({shares[1]:.0f} %)")
     axis.legend()
     figure.tight_layout()
