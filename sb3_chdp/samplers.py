@@ -42,7 +42,6 @@ def sample_hybrid_td3_params(
     sampled_params = {
         "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.001, 0.1, log=True),
         "learning_rate": trial.suggest_float("learning_rate", 1e-5, 2e-3, log=True),
-        "critics_train_codebook": trial.suggest_categorical("critics_train_codebook", [False, True]),
         # From 2**6=64 to 2**9=512
         "batch_size_pow": trial.suggest_int("batch_size_pow", 6, 9),
         # From 1 to 2**4=16
@@ -116,6 +115,7 @@ def sample_chdp_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
         "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.001, 0.1, log=True),
         "learning_rate": trial.suggest_float("learning_rate", 1e-4, 3e-3, log=True),
         "codebook_lr_factor": trial.suggest_float("codebook_lr_factor", 0.01, 1.0, log=True),
+        "critics_train_codebook": trial.suggest_categorical("critics_train_codebook", [False, True]),
         # From 2**6=64 to 2**9=512
         "batch_size_pow": trial.suggest_int("batch_size_pow", 6, 9),
         # From 1 to 2**3=8
