@@ -2,7 +2,7 @@
 What a model of CHDP knows about the pushes of Hard Move: far targets are reached in time only at nearly full speed.
 
     python benchmarks/move_pushes.py                      the published models of n = 4, 6, 8 and 10
-    python benchmarks/move_pushes.py --envs HardMove6-v0 --model benchmarks/results/main/chdp/HardMove6-v0/seed_30.zip
+    python benchmarks/move_pushes.py --envs HardMove6-v0 --model benchmarks/results/main/chdp/HardMove6-v0/seed_40.zip
 
 Prints success by the distance of the target; for all pushes at full strength, forwards and backwards, the rank correlation of
 their Q with their component towards the target; that component for the pushes that the model takes on its way to targets

@@ -56,8 +56,9 @@ def all_losses(model):
     }
 
 
-# Which networks each loss can reach. The critic is reached by the improvement losses as well, and the codebook by the
-# critics' loss, but no optimizer that steps on them holds these parameters (test_each_step_moves_its_own_networks_only)
+# Which networks each loss can reach. The critic is reached by the improvement losses as well, but no optimizer that steps on
+# them holds its parameters; the codebook's steps on the critics' loss only with critics_train_codebook
+# (test_each_step_moves_its_own_networks_only)
 GRADIENTS = {
     "critic": {"critic", "codebook"},
     "discrete diffusion": {"discrete"},

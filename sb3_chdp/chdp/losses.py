@@ -32,7 +32,7 @@ def relabel_latents(
 
 def critic_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, n_target_candidates: int) -> tuple[th.Tensor, th.Tensor]:
     """
-    Mean squared Bellman errors (eq. CHDP_critic_loss_overview), of which the codebook may take a gradient as well.
+    Mean squared Bellman errors (eq. CHDP_critic_loss_overview), with a gradient for the codebook, which may be used.
 
     :param policy: the networks
     :param replay_data: a batch
