@@ -114,16 +114,16 @@ def continuous_policy_loss(
     condition = th.cat([actor_features, actor.codebook(stored_k).detach()], dim=1)
     diffusion_loss = actor.continuous_policy.diffusion_loss(replay_data.parameters, condition, actor.mask(stored_k))
 
+    n_uniform = round(uniform_fraction * len(stored_k))
     if sequential_update:
         with th.no_grad():
-            latents, k = actor.sample_latents(actor_features)
+            latents, k = actor.sample_latents(actor_features[n_uniform:])
     else:
-        latents, k = replay_data.latents, stored_k
-    n_uniform = round(uniform_fraction * len(k))
+        latents, k = replay_data.latents[n_uniform:], stored_k[n_uniform:]
     if n_uniform > 0:
         uniform_k = th.randint(actor.codebook.n_discrete_actions, (n_uniform,), device=k.device)
-        k = th.cat([uniform_k, k[n_uniform:]])
-        latents = th.cat([actor.codebook.representative_latents(uniform_k), latents[n_uniform:]])
+        k = th.cat([uniform_k, k])
+        latents = th.cat([actor.codebook.representative_latents(uniform_k), latents])
     parameters = actor.sample_parameters(actor_features, k)
     q_values = q_to_ascend(policy.critic, critic_features, latents, parameters, improvement_q)
     return diffusion_loss, -q_values.mean(), k

@@ -1,13 +1,13 @@
 """Small helpers that the algorithms share."""
 
 import inspect
+import math
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
-from torch.nn import functional as F
 
 # Rows of a table that are searched at a time, and size of the groups that are told apart first; one divides the other
 NEAREST_ROW_CHUNK, NEAREST_ROW_GROUP = 2048, 128
@@ -37,26 +37,27 @@ def nearest_row(points: th.Tensor, table: th.Tensor) -> th.Tensor:
     :param table: (K, d)
     :return: (B,) index of the row of the table that is nearest in Euclidean distance
     """
-    # |p - t|^2 without |p|^2, which is the same for all rows, as one product: (-2 t, |t|^2) (p, 1)
-    n_rows, dim = table.shape
-    is_large = n_rows > NEAREST_ROW_CHUNK
-    padding = -n_rows % NEAREST_ROW_GROUP if is_large else 0
-    rows = table.new_zeros(n_rows + padding, dim + 1)
-    th.mul(table, -2, out=rows[:n_rows, :dim])
-    rows[:n_rows, dim] = th.linalg.vecdot(table, table)
-    points = F.pad(points, (0, 1), value=1.0)
-    if not is_large:
-        return th.mm(points, rows.t()).min(dim=1).indices
+    # |p - t|^2 without |p|^2, which is the same for all rows
+    n_rows = len(table)
+    factors, squares = -2 * points, th.linalg.vecdot(table, table)
+    if n_rows <= NEAREST_ROW_CHUNK:
+        return th.addmm(squares, factors, table.t()).min(dim=1).indices
     # The distances to all rows of a large table do not fit into the processor's cache, and the place of a minimum takes
     # longer to find than its value: first the nearest group of rows, chunk by chunk, then the row within the group
-    rows[n_rows:, dim] = th.inf
-    columns = points.t().contiguous()
-    of_groups = [
-        th.mm(chunk, columns).view(-1, NEAREST_ROW_GROUP, len(points)).amin(dim=1) for chunk in rows.split(NEAREST_ROW_CHUNK)
-    ]
-    group = th.cat(of_groups).min(dim=0).indices
-    candidates = rows.view(-1, NEAREST_ROW_GROUP, dim + 1)[group]
-    return group * NEAREST_ROW_GROUP + th.bmm(candidates, points[:, :, None]).squeeze(2).argmin(dim=1)
+    columns, group_size = factors.t().contiguous(), NEAREST_ROW_GROUP
+    distances = table.new_empty(NEAREST_ROW_CHUNK, len(points))
+    of_groups = table.new_empty(math.ceil(n_rows / group_size), len(points))
+    chunks = zip(table.split(NEAREST_ROW_CHUNK), squares[:, None].split(NEAREST_ROW_CHUNK), strict=True)
+    chunk_groups = of_groups.split(NEAREST_ROW_CHUNK // group_size)
+    for (chunk, chunk_squares), nearest in zip(chunks, chunk_groups, strict=True):
+        th.addmm(chunk_squares, chunk, columns, out=distances[: len(chunk)])
+        in_groups = distances[: len(nearest) * group_size]
+        in_groups[len(chunk) :] = th.inf
+        th.amin(in_groups.view(-1, group_size, len(points)), dim=1, out=nearest)
+    group = of_groups.min(dim=0).indices
+    rows = (group[:, None] * group_size + th.arange(group_size, device=table.device)).clamp(max=n_rows - 1)
+    in_group = squares[rows] + th.bmm(table[rows], factors[:, :, None]).squeeze(2)
+    return rows.gather(1, in_group.argmin(dim=1, keepdim=True)).squeeze(1)
 
 
 def hash_observations(observations: PyTorchObs) -> th.Tensor:
