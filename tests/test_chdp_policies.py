@@ -199,6 +199,25 @@ def test_random_candidates_find_what_the_policies_miss(deterministic):
     assert errors[1] < 0.1 < errors[0]
 
 
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_refinement(deterministic):
+    """Variations of the best action come nearer to the best parameters; the discrete action and padding stay."""
+    model = filled_model()
+    spec = model.hybrid_space.spec
+    model.critic_target.q_values = lambda features, latents, parameters: (-(parameters[:, :1] - 0.7).abs(),) * 2
+    obs = np.random.uniform(-1, 1, (50, 4)).astype(np.float32)
+    errors = []
+    for model.policy.n_refinement_candidates in (0, 32):
+        rows = model.policy.predict_rows(obs, deterministic)
+        k, parameters = rows[:, 0].astype(int), rows[:, 1 : spec.row_size]
+        errors.append(np.abs(parameters[:, 0] - 0.7).mean())
+        assert (model.actor.codebook.quantize(th.as_tensor(rows[:, spec.row_size :])).numpy() == k).all()
+        assert (parameters[~spec.mask[k].astype(bool)] == 0).all()
+        assert np.abs(parameters).max() <= 1
+        assert (rows == model.policy.predict_rows(obs, deterministic)).all() == deterministic
+    assert errors[1] < 0.7 * errors[0]
+
+
 @pytest.mark.parametrize("k_total", [2, 1000])
 def test_random_rows_decode_to_their_action(k_total):
     env = LayoutEnv(spaces.Tuple((spaces.Discrete(k_total), box(-1, 1, 1))))

@@ -236,7 +236,7 @@ def test_unbounded_parameters(algorithm):
     [(dict(improvement_q="max"), "improvement_q"), (dict(improvement_parameters="x"), "improvement_parameters"),
      (dict(uniform_fraction=1.5), "uniform_fraction"), (dict(beta_schedule="x"), "beta_schedule"),
      (dict(n_diffusion_steps=0), "n_diffusion_steps"), (dict(latent_dim=0), "latent_dim"),
-     (dict(n_random_candidates=-1), "n_random_candidates")],
+     (dict(n_random_candidates=-1), "n_random_candidates"), (dict(n_refinement_candidates=-1), "n_refinement_candidates")],
 )  # fmt: skip
 def test_bad_arguments_of_chdp(kwargs, name):
     with pytest.raises(ValueError, match=name):

@@ -10,6 +10,8 @@ from sb3_chdp.chdp.critic import HybridCritic
 
 # Number of noise chains that repeatable candidates choose from
 FIXED_NOISE_CHAINS = 1024
+# Standard deviations of the changes of the parameters in successive refinements
+REFINEMENT_SPREADS = (0.1, 0.03)
 
 
 class Candidates(NamedTuple):
@@ -94,3 +96,30 @@ def random_candidates(actor: CooperativeActor, batch_size: int, n: int, repeatab
     if repeatable:
         return Candidates(*actor.random_actions(1, n, generator=th.Generator().manual_seed(0)))
     return Candidates(*actor.random_actions(batch_size, n))
+
+
+def varied_candidates(
+    actor: CooperativeActor, latents: th.Tensor, k: th.Tensor, parameters: th.Tensor, n: int, spread: float, repeatable: bool
+) -> Candidates:
+    """
+    Actions and n Gaussian variations of the parameters of each.
+
+    :param actor: the policies
+    :param latents: (B, latent_dim)
+    :param k: (B,) discrete actions
+    :param parameters: (B, Pmax)
+    :param n: number of variations per action
+    :param spread: their standard deviation
+    :param repeatable: whether to vary always in the same way, for all actions
+    :return: candidates of B observations, the given action first, n + 1 in all
+    """
+    batch_size, dim = parameters.shape
+    if repeatable:
+        noise = th.randn(1, n, dim, generator=th.Generator().manual_seed(0)).to(parameters.device)
+    else:
+        noise = th.randn(batch_size, n, dim, device=parameters.device)
+    mask = actor.mask(k)
+    varied = (parameters[:, None] + spread * (noise if mask is None else noise * mask[:, None])).clamp(-1, 1)
+    return Candidates(
+        latents[:, None].expand(-1, n + 1, -1), k[:, None].expand(-1, n + 1), th.cat([parameters[:, None], varied], dim=1)
+    )

@@ -84,6 +84,8 @@ class CHDP(HybridOffPolicyAlgorithm):
         of the target critics is taken
     :param n_random_candidates: number of uniformly random actions that compete with these: a search for what the critics value
         and the policies have not found; best with ``layer_norm`` of :class:`CHDPPolicy` (0: the paper)
+    :param n_refinement_candidates: number of variations of the best of these that compete with it, in each of two rounds, see
+        :class:`CHDPPolicy`: for parameters that have to be exact (0: the paper)
     :param n_target_candidates: number of next actions drawn per transition for the target of the critics, chosen from in
         the same way (1: the paper)
     :param relabel_latents: whether a stored latent that does not decode to the stored discrete action any more is
@@ -156,6 +158,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         uniform_fraction: float = 0.25,
         n_action_candidates: int = 16,
         n_random_candidates: int = 0,
+        n_refinement_candidates: int = 0,
         n_target_candidates: int = 1,
         relabel_latents: bool = True,
         codebook_lr_factor: float = 0.1,
@@ -216,6 +219,7 @@ class CHDP(HybridOffPolicyAlgorithm):
             ("latent_dim", latent_dim, 1),
             ("n_action_candidates", n_action_candidates, 1),
             ("n_random_candidates", n_random_candidates, 0),
+            ("n_refinement_candidates", n_refinement_candidates, 0),
             ("n_target_candidates", n_target_candidates, 1),
             ("policy_delay", policy_delay, 1),
         ):
@@ -231,6 +235,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         self.uniform_fraction = uniform_fraction
         self.n_action_candidates = n_action_candidates
         self.n_random_candidates = n_random_candidates
+        self.n_refinement_candidates = n_refinement_candidates
         self.n_target_candidates = n_target_candidates
         self.relabel_latents = relabel_latents
         self.codebook_lr_factor = codebook_lr_factor
@@ -255,6 +260,7 @@ class CHDP(HybridOffPolicyAlgorithm):
             variance_type=self.variance_type,
             n_action_candidates=self.n_action_candidates,
             n_random_candidates=self.n_random_candidates,
+            n_refinement_candidates=self.n_refinement_candidates,
             uniform_fraction=self.uniform_fraction,
             exploration_noise=self.exploration_noise,
         )

@@ -15,7 +15,13 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_chdp.chdp.actor import CooperativeActor
-from sb3_chdp.chdp.candidates import FIXED_NOISE_CHAINS, policy_candidates, random_candidates
+from sb3_chdp.chdp.candidates import (
+    FIXED_NOISE_CHAINS,
+    REFINEMENT_SPREADS,
+    policy_candidates,
+    random_candidates,
+    varied_candidates,
+)
 from sb3_chdp.chdp.codebook import Codebook, OneHotCodebook
 from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.diffusion import DeterministicModel, DiffusionModel
@@ -60,6 +66,8 @@ class CHDPPolicy(HybridPolicy):
     :param n_action_candidates: number of actions drawn per observation, of which the one with the highest min(Q1, Q2) of
         the target critics acts
     :param n_random_candidates: number of uniformly random actions that compete with these
+    :param n_refinement_candidates: number of variations of the best of all these whose values are compared with its own, in
+        each of two rounds with standard deviations of 0.1 and 0.03 of the scaled parameters
     :param uniform_fraction: share of the drawn candidates whose discrete action is uniformly random
     :param exploration_noise: standard deviation of the exploration noise of policies without diffusion
     """
@@ -90,6 +98,7 @@ class CHDPPolicy(HybridPolicy):
         variance_type: str = "fixed_large",
         n_action_candidates: int = 16,
         n_random_candidates: int = 0,
+        n_refinement_candidates: int = 0,
         uniform_fraction: float = 0.25,
         exploration_noise: float = 0.1,
     ):
@@ -118,6 +127,7 @@ class CHDPPolicy(HybridPolicy):
         self.variance_type = variance_type
         self.n_action_candidates = n_action_candidates
         self.n_random_candidates = n_random_candidates
+        self.n_refinement_candidates = n_refinement_candidates
         self.uniform_fraction = uniform_fraction
         self.exploration_noise = exploration_noise
         self._build(lr_schedule)
@@ -205,6 +215,7 @@ class CHDPPolicy(HybridPolicy):
         critic_features: th.Tensor,
         n_candidates: int,
         n_random: int = 0,
+        n_refinement: int = 0,
         hashes: th.Tensor | None = None,
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
         """
@@ -215,6 +226,7 @@ class CHDPPolicy(HybridPolicy):
         :param critic_features: (B, features_dim) features for the target critics
         :param n_candidates: number of actions that the policies draw per row, see :func:`policy_candidates`
         :param n_random: number of uniformly random actions per row that compete with those
+        :param n_refinement: number of variations of the best one that compete with it, in each of two rounds
         :param hashes: (B,) numbers that decide all that is random; None: draw
         :return: latents (B, latent_dim), discrete actions (B,), parameters (B, Pmax) and their min(Q1, Q2) (B, 1)
         """
@@ -222,12 +234,17 @@ class CHDPPolicy(HybridPolicy):
         candidates = policy_candidates(actor, features, n_candidates, self.uniform_fraction, hashes, noise)
         if n_random > 0:
             candidates = candidates.join(random_candidates(actor, len(features), n_random, repeatable=hashes is not None))
-        return candidates.best(self.critic_target, critic_features)
+        best = candidates.best(self.critic_target, critic_features)
+        for spread in REFINEMENT_SPREADS if n_refinement > 0 else ():
+            candidates = varied_candidates(actor, *best[:3], n_refinement, spread, repeatable=hashes is not None)
+            best = candidates.best(self.critic_target, critic_features)
+        return best
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """
         Draw ``n_action_candidates`` actions per observation and keep the one of highest target min(Q1, Q2), or one of
-        ``n_random_candidates`` uniformly random actions if its value is higher.
+        ``n_random_candidates`` uniformly random actions if its value is higher. That action is then refined, see
+        ``n_refinement_candidates``.
 
         Deterministic predictions take their noise from a fixed store, at a place that depends on the observation: one and
         the same noise in all states would repeat a policy's mistakes where sampling gets away from them. They use the
@@ -244,6 +261,7 @@ class CHDPPolicy(HybridPolicy):
             critic_features,
             self.n_action_candidates,
             self.n_random_candidates,
+            self.n_refinement_candidates,
             hashes,
         )
         return th.cat([k[:, None].float(), parameters, latents], dim=1)
@@ -300,6 +318,7 @@ class CHDPPolicy(HybridPolicy):
                 variance_type=self.variance_type,
                 n_action_candidates=self.n_action_candidates,
                 n_random_candidates=self.n_random_candidates,
+                n_refinement_candidates=self.n_refinement_candidates,
                 uniform_fraction=self.uniform_fraction,
                 exploration_noise=self.exploration_noise,
                 lr_schedule=self._dummy_schedule,  # dummy lr schedule, not needed for loading policy alone
