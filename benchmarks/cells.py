@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import os
 import platform
 import subprocess
 import time
@@ -95,6 +96,14 @@ class Cell:
             return []
         with self.path(".csv").open() as file:
             return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+
+
+def processor() -> str:
+    """:return: name and number of the (virtual) cores of this machine, as far as it tells"""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0] if names else platform.machine()} ({os.cpu_count()} virtual cores)"
 
 
 def gradient_steps_of(model: BaseAlgorithm) -> int:
@@ -204,7 +213,7 @@ def run_cell(cell: Cell) -> str:
         "resumed_at": resumed_at,
         "versions": {"sb3_chdp": sb3_chdp.__version__, "stable_baselines3": sb3.__version__, "torch": th.__version__},
         "commit": commit,
-        "machine": f"{platform.machine()}, Python {platform.python_version()}, {cell.threads} thread(s)",
+        "machine": f"{processor()}, Python {platform.python_version()}, {cell.threads} thread(s)",
     }
     del meta["out"]
     cell.path(".started").write_text(json.dumps(meta, indent=1))

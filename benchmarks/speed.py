@@ -13,14 +13,13 @@ import platform
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import stable_baselines3 as sb3
 import torch as th
-from cells import ALGORITHMS
+from cells import ALGORITHMS, processor
 from dql_style import DQLStyleCHDP
 from gymnasium import spaces
 from stable_baselines3 import TD3
@@ -277,10 +276,9 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=30)
     args = parser.parse_args()
     th.set_num_threads(1)
-    cpu = [line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line]
     text = (
         f"sb3_chdp {sb3_chdp.__version__}, stable_baselines3 {sb3.__version__}, torch {th.__version__}, "
-        f"Python {platform.python_version()}, {cpu[0]} ({len(cpu)} virtual cores), 1 thread\n"
+        f"Python {platform.python_version()}, {processor()}, 1 thread\n"
     )
     print(text)
     for name in args.tables or TABLES:
