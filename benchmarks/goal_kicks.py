@@ -26,7 +26,7 @@ def state_values(model: CHDP, obs: np.ndarray) -> np.ndarray:
     policy, obs_tensor = model.policy, th.as_tensor(obs)
     with th.no_grad():
         features, critic_features = policy.actor_target.features(obs_tensor), policy.critic_target.features(obs_tensor)
-        n_candidates = (policy.n_action_candidates, policy.n_random_candidates)
+        n_candidates = (policy.n_action_candidates, policy.n_random_candidates, policy.n_refinement_candidates)
         *_, values = policy.best_candidate(policy.actor_target, features, critic_features, *n_candidates)
     return values.numpy().ravel()
 

@@ -27,13 +27,18 @@ from rich.table import Table
 
 from sb3_chdp.envs import ENV_IDS
 
-# Row of the ablation table: arguments of CHDP; all with the paper's default parameters, losses and critics
+# Row of the ablation table: arguments of CHDP; all with the paper's default parameters, losses and critics, and without a search
+# beyond the policies' own draws, which would cover up what they lack
 PAPER_DEFAULTS = {
     "n_diffusion_steps": 15,
     "eta": 10.0,
     "latent_dim": 8,
     "improvement_parameters": "stored",
     "uniform_fraction": 0.0,
+    "n_random_candidates": 0,
+    "n_refinement_candidates": 0,
+    "critics_train_codebook": False,
+    "codebook_lr_factor": 0.1,
     "n_target_candidates": 1,
     "policy_kwargs": {"layer_norm": False, "parameter_degree": 1, "bilinear": False},
 }
