@@ -27,8 +27,8 @@ from rich.table import Table
 
 from sb3_chdp.envs import ENV_IDS
 
-# Row of the ablation table: arguments of CHDP; all with the paper's default parameters, losses and critics, and without a search
-# beyond the policies' own draws, which would cover up what they lack
+# Row of the ablation table: arguments of CHDP; all with the paper's default parameters, losses and critics, and without a
+# search beyond the policies' own draws, which would cover up what they lack
 PAPER_DEFAULTS = {
     "n_diffusion_steps": 15,
     "eta": 10.0,

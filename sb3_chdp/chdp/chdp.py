@@ -11,6 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
 
 from sb3_chdp.chdp.actor import CooperativeActor
+from sb3_chdp.chdp.codebook import codebook_usage
 from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.exploration import vary_parts
 from sb3_chdp.chdp.losses import (
@@ -24,7 +25,7 @@ from sb3_chdp.chdp.losses import (
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
-from sb3_chdp.common.utils import polyak_update
+from sb3_chdp.common.utils import gradient_step, polyak_update
 
 
 class CHDP(HybridOffPolicyAlgorithm):
@@ -292,6 +293,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         self.policy.set_training_mode(True)
         policy = self.policy
         self._update_learning_rates()
+        codebook_optimizer = [] if policy.codebook_optimizer is None else [policy.codebook_optimizer]
 
         logs: dict[str, list[th.Tensor]] = {}
         for _ in range(gradient_steps):
@@ -300,7 +302,8 @@ class CHDP(HybridOffPolicyAlgorithm):
 
             # Step 0: critics, and the codebook if they train it
             loss, q_values = critic_loss(policy, replay_data, self.n_target_candidates)
-            self._optimize(loss, policy.critic.optimizer, policy.codebook_optimizer if self.critics_train_codebook else None)
+            also = codebook_optimizer if self.critics_train_codebook else []
+            gradient_step(loss, [policy.critic.optimizer, *also], self.max_grad_norm)
             self.actor.codebook.project()
             losses = {"critic_loss": loss, "q_mean": q_values.mean(), "latent_drift": drift}
 
@@ -317,7 +320,7 @@ class CHDP(HybridOffPolicyAlgorithm):
                     policy, replay_data, *features, self.improvement_q, self.improvement_parameters
                 )
                 loss = diffusion_loss + alpha * q_loss
-                self._optimize(loss, policy.discrete_optimizer)
+                gradient_step(loss, [policy.discrete_optimizer], self.max_grad_norm)
                 losses |= {"discrete_loss": loss, "diffusion_loss_discrete": diffusion_loss}
 
                 # Step 2: continuous policy and codebook, given the updated discrete policy
@@ -325,7 +328,7 @@ class CHDP(HybridOffPolicyAlgorithm):
                     policy, replay_data, *features, self.improvement_q, self.sequential_update, self.uniform_fraction
                 )
                 loss = diffusion_loss + alpha * q_loss
-                self._optimize(loss, policy.continuous_optimizer, policy.codebook_optimizer)
+                gradient_step(loss, [policy.continuous_optimizer, *codebook_optimizer], self.max_grad_norm)
                 self.actor.codebook.project()
                 losses |= {"continuous_loss": loss, "diffusion_loss_continuous": diffusion_loss}
 
@@ -340,7 +343,9 @@ class CHDP(HybridOffPolicyAlgorithm):
         for name, values in logs.items():
             self.logger.record(f"train/{name}", th.stack(values).mean().item())
         if "continuous_loss" in logs:
-            self._log_codebook_usage(k)
+            usage, perplexity = codebook_usage(k, self.hybrid_space.spec.n_discrete_actions)
+            self.logger.record("train/codebook_usage", usage)
+            self.logger.record("train/codebook_perplexity", perplexity)
 
     def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         if not self.explore_parts:
@@ -356,29 +361,6 @@ class CHDP(HybridOffPolicyAlgorithm):
             rate = self.codebook_lr_factor * self.lr_schedule(self._current_progress_remaining)
             update_learning_rate(policy.codebook_optimizer, rate)
             self.logger.record("train/codebook_learning_rate", rate)
-
-    def _optimize(self, loss: th.Tensor, *optimizers: th.optim.Optimizer | None) -> None:
-        """One gradient step of the parameters of the given optimizers, and of no others."""
-        used = [optimizer for optimizer in optimizers if optimizer is not None]
-        groups = [[p for group in optimizer.param_groups for p in group["params"]] for optimizer in used]
-        params = [p for group in groups for p in group]
-        for p, gradient in zip(params, th.autograd.grad(loss, params), strict=True):
-            p.grad = gradient
-        for optimizer, group in zip(used, groups, strict=True):
-            if self.max_grad_norm is not None:
-                th.nn.utils.clip_grad_norm_(group, self.max_grad_norm)
-            optimizer.step()
-
-    def _log_codebook_usage(self, k: th.Tensor) -> None:
-        """
-        Log how many actions the discrete policy uses in a batch.
-
-        :param k: (B,) discrete actions
-        """
-        frequencies = th.unique(k, return_counts=True)[1] / len(k)
-        perplexity = (-(frequencies * frequencies.log()).sum()).exp()
-        self.logger.record("train/codebook_usage", len(frequencies) / self.hybrid_space.spec.n_discrete_actions)
-        self.logger.record("train/codebook_perplexity", perplexity.item())
 
     def _excluded_save_params(self) -> list[str]:
         networks = ["actor", "critic", "actor_target", "critic_target"]

@@ -69,3 +69,16 @@ class OneHotCodebook(nn.Module):
 
     def project(self) -> None:
         """Nothing to do, see :meth:`Codebook.project`."""
+
+
+def codebook_usage(k: th.Tensor, n_discrete_actions: int) -> tuple[float, float]:
+    """
+    How many actions a batch uses.
+
+    :param k: (B,) discrete actions
+    :param n_discrete_actions: number K of codewords
+    :return: share of the K actions that occur, and perplexity of their frequencies: as many, if they were equally frequent
+    """
+    frequencies = th.unique(k, return_counts=True)[1] / len(k)
+    perplexity = (-(frequencies * frequencies.log()).sum()).exp()
+    return len(frequencies) / n_discrete_actions, perplexity.item()

@@ -25,6 +25,24 @@ def polyak_update(params: Iterable[th.Tensor], target_params: Iterable[th.Tensor
         th._foreach_lerp_(list(target_params), list(params), tau)
 
 
+def gradient_step(loss: th.Tensor, optimizers: list[th.optim.Optimizer], max_grad_norm: float | None) -> None:
+    """
+    One gradient step of the parameters of the given optimizers, and of no others.
+
+    :param loss: the loss to minimise
+    :param optimizers: their parameters are all that moves
+    :param max_grad_norm: bound on the gradient norm of each optimizer's parameters, None for none
+    """
+    groups = [[p for group in optimizer.param_groups for p in group["params"]] for optimizer in optimizers]
+    params = [p for group in groups for p in group]
+    for p, gradient in zip(params, th.autograd.grad(loss, params), strict=True):
+        p.grad = gradient
+    for optimizer, group in zip(optimizers, groups, strict=True):
+        if max_grad_norm is not None:
+            th.nn.utils.clip_grad_norm_(group, max_grad_norm)
+        optimizer.step()
+
+
 def default_optimizer_kwargs(optimizer_class: type[th.optim.Optimizer]) -> dict[str, Any]:
     """:return: ``fused=True`` for Adam: one kernel per step instead of a loop over parameters"""
     return {"fused": True} if optimizer_class == th.optim.Adam else {}
