@@ -1,5 +1,7 @@
 """The codebook of CHDP, and how its policies act."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch as th
@@ -199,23 +201,23 @@ def test_random_candidates_find_what_the_policies_miss(deterministic):
     assert errors[1] < 0.1 < errors[0]
 
 
-@pytest.mark.parametrize("deterministic", [True, False])
-def test_refinement(deterministic):
+def test_deterministic_actions_are_refined():
     """Variations of the best action come nearer to the best parameters; the discrete action and padding stay."""
     model = filled_model()
     spec = model.hybrid_space.spec
     model.critic_target.q_values = lambda features, latents, parameters: (-(parameters[:, :1] - 0.7).abs(),) * 2
     obs = np.random.uniform(-1, 1, (50, 4)).astype(np.float32)
-    errors = []
-    for model.policy.n_refinement_candidates in (0, 32):
+    errors = {}
+    for model.policy.n_refinement_candidates, deterministic in itertools.product((0, 32), (False, True)):
         rows = model.policy.predict_rows(obs, deterministic)
         k, parameters = rows[:, 0].astype(int), rows[:, 1 : spec.row_size]
-        errors.append(np.abs(parameters[:, 0] - 0.7).mean())
+        errors[model.policy.n_refinement_candidates, deterministic] = np.abs(parameters[:, 0] - 0.7).mean()
         assert (model.actor.codebook.quantize(th.as_tensor(rows[:, spec.row_size :])).numpy() == k).all()
         assert (parameters[~spec.mask[k].astype(bool)] == 0).all()
         assert np.abs(parameters).max() <= 1
         assert (rows == model.policy.predict_rows(obs, deterministic)).all() == deterministic
-    assert errors[1] < 0.7 * errors[0]
+    assert errors[32, True] < 0.7 * errors[0, True]
+    assert errors[32, False] > 0.7 * errors[0, False]
 
 
 @pytest.mark.parametrize("k_total", [2, 1000])

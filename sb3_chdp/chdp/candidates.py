@@ -99,10 +99,10 @@ def random_candidates(actor: CooperativeActor, batch_size: int, n: int, repeatab
 
 
 def varied_candidates(
-    actor: CooperativeActor, latents: th.Tensor, k: th.Tensor, parameters: th.Tensor, n: int, spread: float, repeatable: bool
+    actor: CooperativeActor, latents: th.Tensor, k: th.Tensor, parameters: th.Tensor, n: int, spread: float
 ) -> Candidates:
     """
-    Actions and n Gaussian variations of the parameters of each.
+    Actions and n Gaussian variations of the parameters of each, always the same ones.
 
     :param actor: the policies
     :param latents: (B, latent_dim)
@@ -110,14 +110,9 @@ def varied_candidates(
     :param parameters: (B, Pmax)
     :param n: number of variations per action
     :param spread: their standard deviation
-    :param repeatable: whether to vary always in the same way, for all actions
     :return: candidates of B observations, the given action first, n + 1 in all
     """
-    batch_size, dim = parameters.shape
-    if repeatable:
-        noise = th.randn(1, n, dim, generator=th.Generator().manual_seed(0)).to(parameters.device)
-    else:
-        noise = th.randn(batch_size, n, dim, device=parameters.device)
+    noise = th.randn(1, n, parameters.shape[1], generator=th.Generator().manual_seed(0)).to(parameters.device)
     mask = actor.mask(k)
     varied = (parameters[:, None] + spread * (noise if mask is None else noise * mask[:, None])).clamp(-1, 1)
     return Candidates(

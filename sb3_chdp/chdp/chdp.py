@@ -85,8 +85,8 @@ class CHDP(HybridOffPolicyAlgorithm):
         of the target critics is taken
     :param n_random_candidates: number of uniformly random actions that compete with these: a search for what the critics value
         and the policies have not found; best with ``layer_norm`` of :class:`CHDPPolicy` (0: the paper)
-    :param n_refinement_candidates: number of variations of the best of these that compete with it, in each of two rounds, see
-        :class:`CHDPPolicy`: for parameters that have to be exact (0: the paper)
+    :param n_refinement_candidates: number of variations of the best of these that compete with it in deterministic
+        predictions, in each of two rounds, see :class:`CHDPPolicy`: for parameters that have to be exact (0: the paper)
     :param n_target_candidates: number of next actions drawn per transition for the target of the critics, chosen from in
         the same way (1: the paper)
     :param relabel_latents: whether a stored latent that does not decode to the stored discrete action any more is

@@ -67,7 +67,7 @@ class CHDPPolicy(HybridPolicy):
         the target critics acts
     :param n_random_candidates: number of uniformly random actions that compete with these
     :param n_refinement_candidates: number of variations of the best of all these whose values are compared with its own, in
-        each of two rounds with standard deviations of 0.1 and 0.03 of the scaled parameters
+        each of two rounds with standard deviations of 0.1 and 0.03 of the scaled parameters; in deterministic predictions only
     :param uniform_fraction: share of the drawn candidates whose discrete action is uniformly random
     :param exploration_noise: standard deviation of the exploration noise of policies without diffusion
     """
@@ -236,19 +236,19 @@ class CHDPPolicy(HybridPolicy):
             candidates = candidates.join(random_candidates(actor, len(features), n_random, repeatable=hashes is not None))
         best = candidates.best(self.critic_target, critic_features)
         for spread in REFINEMENT_SPREADS if n_refinement > 0 else ():
-            candidates = varied_candidates(actor, *best[:3], n_refinement, spread, repeatable=hashes is not None)
+            candidates = varied_candidates(actor, *best[:3], n_refinement, spread)
             best = candidates.best(self.critic_target, critic_features)
         return best
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """
         Draw ``n_action_candidates`` actions per observation and keep the one of highest target min(Q1, Q2), or one of
-        ``n_random_candidates`` uniformly random actions if its value is higher. That action is then refined, see
-        ``n_refinement_candidates``.
+        ``n_random_candidates`` uniformly random actions if its value is higher.
 
         Deterministic predictions take their noise from a fixed store, at a place that depends on the observation: one and
         the same noise in all states would repeat a policy's mistakes where sampling gets away from them. They use the
-        target policies, averages of the policies over the last updates, which do not waver as those do.
+        target policies, averages of the policies over the last updates, which do not waver as those do, and refine what
+        they chose, see ``n_refinement_candidates``: in rollouts that would cost variety.
 
         :return: (B, 1 + Pmax + latent_dim) rows
         """
@@ -261,7 +261,7 @@ class CHDPPolicy(HybridPolicy):
             critic_features,
             self.n_action_candidates,
             self.n_random_candidates,
-            self.n_refinement_candidates,
+            self.n_refinement_candidates if deterministic else 0,
             hashes,
         )
         return th.cat([k[:, None].float(), parameters, latents], dim=1)
