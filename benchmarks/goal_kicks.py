@@ -2,7 +2,7 @@
 What a model of CHDP knows about the first kick on Goal or Hard Goal, by the height of the start.
 
     python benchmarks/goal_kicks.py                       the published model of Hard Goal
-    python benchmarks/goal_kicks.py --env Goal-v0 --model benchmarks/results/main/chdp/Goal-v0/seed_60.zip
+    python benchmarks/goal_kicks.py --env Goal-v0 --model benchmarks/results/main/chdp/Goal-v0/seed_80.zip
 
 Prints success and length of episodes; how often the best of 200 random kicks, followed by the policy, scores: what better
 first kicks could gain; and for kicks to (v, 0) two values that agree if the critics have learnt: Q of the kick, and the

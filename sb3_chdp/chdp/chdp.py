@@ -40,7 +40,8 @@ class CHDP(HybridOffPolicyAlgorithm):
     Space", AAAI 2026. No reference code is published.
 
     Differences from the paper:
-        1. the action of highest Q among ``n_action_candidates`` draws acts (1: the paper);
+        1. the action of highest Q among ``n_action_candidates`` draws acts (1: the paper), see also ``n_random_candidates``
+           and ``n_refinement_candidates``;
         2. random actions with a decreasing probability, see ``exploration_initial_eps`` (0: the paper) and ``explore_parts``;
         3. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
            stored ones, see ``improvement_parameters`` ("stored": the paper);
