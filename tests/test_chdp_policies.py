@@ -203,10 +203,12 @@ def test_random_candidates_find_what_the_policies_miss(deterministic):
 
 def test_deterministic_actions_are_refined():
     """Variations of the best action come nearer to the best parameters; the discrete action and padding stay."""
-    model = filled_model()
+    parameters = spaces.Tuple((box(-1, 1, 1), box(-1, 1, 2)))
+    model = filled_model(LayoutEnv(spaces.Tuple((spaces.Discrete(2), parameters))))
     spec = model.hybrid_space.spec
+    assert not spec.mask.all()
     model.critic_target.q_values = lambda features, latents, parameters: (-(parameters[:, :1] - 0.7).abs(),) * 2
-    obs = np.random.uniform(-1, 1, (50, 4)).astype(np.float32)
+    obs = np.random.uniform(-1, 1, (50, 2)).astype(np.float32)
     errors = {}
     for model.policy.n_refinement_candidates, deterministic in itertools.product((0, 32), (False, True)):
         rows = model.policy.predict_rows(obs, deterministic)
@@ -218,6 +220,7 @@ def test_deterministic_actions_are_refined():
         assert (rows == model.policy.predict_rows(obs, deterministic)).all() == deterministic
     assert errors[32, True] < 0.7 * errors[0, True]
     assert errors[32, False] > 0.7 * errors[0, False]
+    assert model.policy._get_constructor_parameters()["n_refinement_candidates"] == 32
 
 
 @pytest.mark.parametrize("k_total", [2, 1000])

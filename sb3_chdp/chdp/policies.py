@@ -248,7 +248,7 @@ class CHDPPolicy(HybridPolicy):
         Deterministic predictions take their noise from a fixed store, at a place that depends on the observation: one and
         the same noise in all states would repeat a policy's mistakes where sampling gets away from them. They use the
         target policies, averages of the policies over the last updates, which do not waver as those do, and refine what
-        they chose, see ``n_refinement_candidates``: in rollouts that would cost variety.
+        they chose, see ``n_refinement_candidates``; in rollouts that did no good on Hard Goal.
 
         :return: (B, 1 + Pmax + latent_dim) rows
         """
