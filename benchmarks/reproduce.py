@@ -38,6 +38,7 @@ PAPER_DEFAULTS = {
     "n_random_candidates": 0,
     "n_refinement_candidates": 0,
     "critics_train_codebook": False,
+    "prioritized_replay": False,
     "codebook_lr_factor": 0.1,
     "n_target_candidates": 1,
     "policy_kwargs": {"layer_norm": False, "parameter_degree": 1, "bilinear": False},

@@ -126,6 +126,7 @@ def sample_chdp_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
         "n_target_candidates_pow": trial.suggest_int("n_target_candidates_pow", 0, 4),
         "uniform_fraction": trial.suggest_categorical("uniform_fraction", [0.0, 0.25, 0.5, 0.75]),
         "explore_parts": trial.suggest_categorical("explore_parts", [False, True]),
+        "prioritized_replay": trial.suggest_categorical("prioritized_replay", [False, True]),
         "layer_norm": trial.suggest_categorical("layer_norm", [False, True]),
         "parameter_degree": trial.suggest_categorical("parameter_degree", [1, 4]),
         "bilinear": trial.suggest_categorical("bilinear", [False, True]),

@@ -187,7 +187,7 @@ def test_critic_target():
         y = data.rewards + 0.9 * (1 - data.dones) * th.min(q1, q2)
         ours = model.critic.q_values(data.observations, data.latents, data.parameters)
         expected = sum(F.mse_loss(q, y) for q in ours)
-    loss, q_values = losses.critic_loss(model.policy, data, 1)
+    loss, q_values, _ = losses.critic_loss(model.policy, data, 1)
     th.testing.assert_close(loss.detach(), expected)
     th.testing.assert_close(q_values, ours[0])
     shorter = losses.critic_loss(model.policy, data._replace(discounts=th.full((32, 1), 0.1)), 1)[0]
@@ -199,7 +199,7 @@ def test_best_of_several_next_actions_counts():
     data = batch_of(model)
     seen, q_values = [], model.critic_target.q_values
     model.critic_target.q_values = lambda *args: seen.append(q_values(*args)) or seen[-1]
-    loss, _ = losses.critic_loss(model.policy, data, 4)
+    loss, *_ = losses.critic_loss(model.policy, data, 4)
     next_q = th.min(*seen[0]).view(32, 4).max(dim=1, keepdim=True).values
     y = data.rewards + 0.9 * (1 - data.dones) * next_q
     ours = model.critic.q_values(data.observations, data.latents, data.parameters)
@@ -284,7 +284,7 @@ def test_two_seeded_runs_are_identical():
                dict(codebook=False, sequential_update=False), dict(improvement_q="min"), dict(improvement_q="mean"),
                dict(variance_type="fixed_small", beta_schedule="cosine"), dict(n_action_candidates=1),
                dict(improvement_parameters="stored", uniform_fraction=0), dict(n_target_candidates=4, n_random_candidates=4),
-               dict(n_refinement_candidates=4),
+               dict(n_refinement_candidates=4), dict(prioritized_replay=True),
                dict(max_grad_norm=None), dict(policy_kwargs=dict(layer_norm=True, parameter_degree=3, bilinear=True)),
                dict(codebook_lr_factor=1.0, critics_train_codebook=True), dict(n_diffusion_steps=1), dict(uniform_fraction=1)],
     ids=str,

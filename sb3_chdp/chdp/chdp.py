@@ -4,6 +4,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
@@ -23,6 +24,7 @@ from sb3_chdp.chdp.losses import (
     relabel_latents,
 )
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_chdp.common.buffers import PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.utils import gradient_step, polyak_update
@@ -51,7 +53,8 @@ class CHDP(HybridOffPolicyAlgorithm):
         6. gradient norms are clipped, see ``max_grad_norm``;
         7. the critics' loss can train the codebook, which makes many discrete actions learnable, see
            ``critics_train_codebook`` (False: the paper);
-        8. codewords are kept in [-1, 1], where the latents are (not an argument: without it they drift away, and latents
+        8. transitions of large TD error can be replayed more often, see ``prioritized_replay`` (False: the paper);
+        9. codewords are kept in [-1, 1], where the latents are (not an argument: without it they drift away, and latents
            can no longer reach them).
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
@@ -90,6 +93,8 @@ class CHDP(HybridOffPolicyAlgorithm):
         predictions, in each of two rounds, see :class:`CHDPPolicy`: for parameters that have to be exact (0: the paper)
     :param n_target_candidates: number of next actions drawn per transition for the target of the critics, chosen from in
         the same way (1: the paper)
+    :param prioritized_replay: whether transitions of large TD error are replayed more often, see
+        :class:`PrioritizedReplayBuffer`, whose arguments ``replay_buffer_kwargs`` can hold (False: the paper)
     :param relabel_latents: whether a stored latent that does not decode to the stored discrete action any more is
         replaced by that action's present codeword
     :param codebook_lr_factor: learning rate of the codebook relative to that of the networks; the faster it moves, the
@@ -162,6 +167,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         n_random_candidates: int = 0,
         n_refinement_candidates: int = 0,
         n_target_candidates: int = 1,
+        prioritized_replay: bool = False,
         relabel_latents: bool = True,
         codebook_lr_factor: float = 0.1,
         critics_train_codebook: bool = False,
@@ -227,6 +233,10 @@ class CHDP(HybridOffPolicyAlgorithm):
         ):
             if value < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
+        if prioritized_replay and (n_steps > 1 or replay_buffer_class is not None):
+            raise ValueError(
+                f"prioritized_replay=True needs n_steps=1 and no replay_buffer_class, got {n_steps} and {replay_buffer_class}"
+            )
         self.latent_dim = latent_dim
         self.n_diffusion_steps = n_diffusion_steps
         self.beta_schedule = beta_schedule
@@ -239,6 +249,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         self.n_random_candidates = n_random_candidates
         self.n_refinement_candidates = n_refinement_candidates
         self.n_target_candidates = n_target_candidates
+        self.prioritized_replay = prioritized_replay
         self.relabel_latents = relabel_latents
         self.codebook_lr_factor = codebook_lr_factor
         self.critics_train_codebook = critics_train_codebook
@@ -273,6 +284,9 @@ class CHDP(HybridOffPolicyAlgorithm):
         return HybridBox(self.action_space, self.action_layout, latent_dim)
 
     def _setup_model(self) -> None:
+        if self.prioritized_replay:
+            with_dict = isinstance(self.observation_space, spaces.Dict)
+            self.replay_buffer_class = PrioritizedDictReplayBuffer if with_dict else PrioritizedReplayBuffer
         super()._setup_model()
         self._create_aliases()
         online, target = (self.actor, self.critic), (self.actor_target, self.critic_target)
@@ -302,7 +316,9 @@ class CHDP(HybridOffPolicyAlgorithm):
             replay_data, drift = relabel_latents(policy, self._sample_batch(batch_size), self.relabel_latents)
 
             # Step 0: critics, and the codebook if they train it
-            loss, q_values = critic_loss(policy, replay_data, self.n_target_candidates)
+            loss, q_values, errors = critic_loss(policy, replay_data, self.n_target_candidates)
+            if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
+                self.replay_buffer.update_priorities(errors)
             also = codebook_optimizer if self.critics_train_codebook else []
             gradient_step(loss, [policy.critic.optimizer, *also], self.max_grad_norm)
             self.actor.codebook.project()

@@ -1,7 +1,6 @@
 """The losses of CHDP, one function for each of the paper's equations, and the relabelling of stored latents."""
 
 import torch as th
-from torch.nn import functional as F
 
 from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.policies import CHDPPolicy
@@ -30,14 +29,17 @@ def relabel_latents(
     return replay_data, drifted.float().mean()
 
 
-def critic_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, n_target_candidates: int) -> tuple[th.Tensor, th.Tensor]:
+def critic_loss(
+    policy: CHDPPolicy, replay_data: HybridReplaySamples, n_target_candidates: int
+) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """
-    Mean squared Bellman errors (eq. CHDP_critic_loss_overview), with a gradient for the codebook, which may be used.
+    Mean squared Bellman errors (eq. CHDP_critic_loss_overview), weighted if the replay is prioritised, with a gradient for
+    the codebook, which may be used.
 
     :param policy: the networks
     :param replay_data: a batch
     :param n_target_candidates: number of next actions drawn per transition, of which the best counts
-    :return: their sum over both critics, and the detached (B, 1) values of the first
+    :return: their sum over both critics, the detached (B, 1) values of the first, and the larger (B,) absolute error of both
     """
     critic, critic_target, actor_target = policy.critic, policy.critic_target, policy.actor_target
     with th.no_grad():
@@ -51,7 +53,9 @@ def critic_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, n_target_c
     codewords = policy.actor.codebook(replay_data.discrete_actions)
     latents = replay_data.latents + (codewords - codewords.detach())
     q1, q2 = critic.q_values(features, latents, replay_data.parameters)
-    return F.mse_loss(q1, target_q_values) + F.mse_loss(q2, target_q_values), q1.detach()
+    errors = th.cat([q1, q2], dim=1) - target_q_values
+    loss = (replay_data.weights * errors.square()).sum(dim=1).mean()
+    return loss, q1.detach(), errors.detach().abs().amax(dim=1)
 
 
 def discrete_policy_loss(

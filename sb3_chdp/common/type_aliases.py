@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs, ReplayBufferSamples
 
+from sb3_chdp.common.buffers import PrioritizedReplayBufferSamples
 from sb3_chdp.common.hybrid_box import HybridBox
 
 
@@ -13,7 +14,7 @@ class HybridReplaySamples(NamedTuple):
     A batch with the columns of its action rows named.
 
     Shapes: discrete_actions (B,) int64, parameters (B, Pmax) in [-1, 1] with padding 0, latents (B, latent_dim),
-    rewards, dones and discounts (B, 1).
+    rewards, dones, discounts and weights (B, 1).
     """
 
     observations: PyTorchObs
@@ -24,9 +25,12 @@ class HybridReplaySamples(NamedTuple):
     dones: th.Tensor
     rewards: th.Tensor
     discounts: th.Tensor | float
+    weights: th.Tensor | float = 1.0
 
 
-def name_columns(replay_data: ReplayBufferSamples, action_space: HybridBox, gamma: float) -> HybridReplaySamples:
+def name_columns(
+    replay_data: ReplayBufferSamples | PrioritizedReplayBufferSamples, action_space: HybridBox, gamma: float
+) -> HybridReplaySamples:
     """
     :param replay_data: what ``ReplayBuffer.sample`` returned
     :param action_space: the space of the stored rows
@@ -42,4 +46,5 @@ def name_columns(replay_data: ReplayBufferSamples, action_space: HybridBox, gamm
         dones=replay_data.dones,
         rewards=replay_data.rewards,
         discounts=gamma if replay_data.discounts is None else replay_data.discounts,
+        weights=getattr(replay_data, "weights", 1.0),
     )

@@ -1,0 +1,115 @@
+"""Replay buffers that replay transitions of large TD error more often."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.common.vec_env import VecNormalize
+
+# Added to every error, so that no transition is forgotten
+PRIORITY_EPSILON = 1e-3
+# Time steps and environments of transitions
+Index = tuple[np.ndarray, np.ndarray]
+
+
+class PrioritizedReplayBufferSamples(NamedTuple):
+    """SB3's ``ReplayBufferSamples`` and the (B, 1) importance weights in (0, 1]."""
+
+    observations: PyTorchObs
+    actions: th.Tensor
+    next_observations: PyTorchObs
+    dones: th.Tensor
+    rewards: th.Tensor
+    weights: th.Tensor
+    # For n-step replay buffers, which this is not
+    discounts: None = None
+
+
+class PrioritizedReplayBuffer(ReplayBuffer):
+    """
+    Replay buffer that samples a transition i with probability P(i) proportional to (\\|TD error\\| + epsilon)^alpha.
+
+    New transitions count as the highest priority so far, until they have been sampled and
+    :meth:`update_priorities` was called. The losses are to be weighted by (N P(i))^-beta, divided by the largest of the batch.
+
+    Source: Schaul et al. (2016), "Prioritized Experience Replay", https://arxiv.org/abs/1511.05952, proportional variant
+    with stratified sampling; beta stays constant. In place of a sum tree, priorities are summed up anew for every batch: a
+    fast pass over memory that costs little beside a gradient step.
+
+    :param args: those of :class:`stable_baselines3.common.buffers.ReplayBuffer`
+    :param alpha: how much errors count, from 0 (uniform sampling) to 1
+    :param beta: how much of the sampling's bias the weights take back, from 0 to 1 (all of it)
+    :param kwargs: those of :class:`stable_baselines3.common.buffers.ReplayBuffer`
+    :raises ValueError: for ``optimize_memory_usage=True``, or an alpha or beta out of range
+    """
+
+    def __init__(self, *args: Any, alpha: float = 0.6, beta: float = 0.4, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        if self.optimize_memory_usage:
+            raise ValueError(f"{type(self).__name__} does not support optimize_memory_usage=True")
+        for name, value in (("alpha", alpha), ("beta", beta)):
+            if not 0 <= value <= 1:
+                raise ValueError(f"{name} must be between 0 and 1, got {value}")
+        self.alpha, self.beta = alpha, beta
+        self.priorities = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
+        self.max_priority = 1.0
+        self._last_batch: Index = (np.zeros(0, dtype=int), np.zeros(0, dtype=int))
+
+    def add(self, *args: Any, **kwargs: Any) -> None:
+        """See :meth:`stable_baselines3.common.buffers.ReplayBuffer.add`."""
+        self.priorities[self.pos] = self.max_priority
+        super().add(*args, **kwargs)
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> PrioritizedReplayBufferSamples:  # type: ignore[override]
+        """
+        :param batch_size: number B of transitions
+        :param env: VecEnv that normalises observations and rewards
+        :return: a batch with its weights
+        """
+        index, probabilities = self._draw(batch_size)
+        self._last_batch = index
+        weights = (self.size() * self.n_envs * probabilities) ** -self.beta
+        return PrioritizedReplayBufferSamples(
+            observations=self._observations_at(self.observations, index, env),
+            actions=self.to_torch(self.actions[index]),
+            next_observations=self._observations_at(self.next_observations, index, env),
+            # Only use dones that are not due to timeouts
+            dones=self.to_torch(self.dones[index] * (1 - self.timeouts[index])).reshape(-1, 1),
+            rewards=self.to_torch(self._normalize_reward(self.rewards[index].reshape(-1, 1), env)),
+            weights=self.to_torch((weights / weights.max()).astype(np.float32)).reshape(-1, 1),
+        )
+
+    def update_priorities(self, errors: th.Tensor) -> None:
+        """
+        :param errors: (B,) TD errors of the last batch, of any sign
+        """
+        priorities = (errors.abs().cpu().numpy() + PRIORITY_EPSILON) ** self.alpha
+        self.priorities[self._last_batch] = priorities
+        self.max_priority = max(self.max_priority, float(priorities.max()))
+
+    def _draw(self, batch_size: int) -> tuple[Index, np.ndarray]:
+        """:return: time steps and environments of B transitions, (B,) their probabilities"""
+        of_times = self.priorities[: self.size()].sum(axis=1, dtype=np.float64)
+        ends = np.cumsum(of_times)
+        # One draw from each of B equal parts of the sum; first the time step, then the environment
+        draws = (np.arange(batch_size) + np.random.random(batch_size)) * (ends[-1] / batch_size)
+        times = np.minimum(np.searchsorted(ends, draws, side="right"), len(ends) - 1)
+        env_ends = np.cumsum(self.priorities[times], axis=1, dtype=np.float64)
+        rest = draws - (ends[times] - of_times[times])
+        envs = np.minimum((env_ends <= rest[:, None]).sum(axis=1), self.n_envs - 1)
+        return (times, envs), self.priorities[times, envs] / ends[-1]
+
+    def _observations_at(
+        self, observations: np.ndarray | dict[str, np.ndarray], index: Index, env: VecNormalize | None
+    ) -> PyTorchObs:
+        if isinstance(observations, dict):
+            parts = self._normalize_obs({key: part[index] for key, part in observations.items()}, env)
+            assert isinstance(parts, dict)
+            return {key: self.to_torch(part) for key, part in parts.items()}
+        return self.to_torch(self._normalize_obs(observations[index], env))  # type: ignore[arg-type]
+
+
+class PrioritizedDictReplayBuffer(PrioritizedReplayBuffer, DictReplayBuffer):  # type: ignore[misc]
+    """:class:`PrioritizedReplayBuffer` for dict observations."""
