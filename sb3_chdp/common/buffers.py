@@ -1,5 +1,6 @@
 """Replay buffers that replay transitions of large TD error more often."""
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +11,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 # Added to every error, so that no transition is forgotten
 PRIORITY_EPSILON = 1e-3
+# Transitions whose priorities are summed up before the sums are searched
+BLOCK = 1024
 # Time steps and environments of transitions
 Index = tuple[np.ndarray, np.ndarray]
 
@@ -29,7 +32,7 @@ class PrioritizedReplayBufferSamples(NamedTuple):
 
 class PrioritizedReplayBuffer(ReplayBuffer):
     """
-    Replay buffer that samples a transition i with probability P(i) proportional to (\\|TD error\\| + epsilon)^alpha.
+    Replay buffer that samples a transition i with probability P(i) proportional to (|TD error| + epsilon)^alpha.
 
     New transitions count as the highest priority so far, until they have been sampled and
     :meth:`update_priorities` was called. The losses are to be weighted by (N P(i))^-beta, divided by the largest of the batch.
@@ -53,9 +56,16 @@ class PrioritizedReplayBuffer(ReplayBuffer):
             if not 0 <= value <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, got {value}")
         self.alpha, self.beta = alpha, beta
-        self.priorities = np.zeros((self.buffer_size, self.n_envs), dtype=np.float32)
+        # Of all places, whether filled or not, and zeros that complete the last block
+        size = self.buffer_size * self.n_envs
+        self._priorities = np.zeros(math.ceil(size / BLOCK) * BLOCK, dtype=np.float32)
         self.max_priority = 1.0
         self._last_batch: Index = (np.zeros(0, dtype=int), np.zeros(0, dtype=int))
+
+    @property
+    def priorities(self) -> np.ndarray:
+        """:return: (buffer_size, n_envs) priorities, 0 where there is no transition yet"""
+        return self._priorities[: self.buffer_size * self.n_envs].reshape(self.buffer_size, self.n_envs)
 
     def add(self, *args: Any, **kwargs: Any) -> None:
         """See :meth:`stable_baselines3.common.buffers.ReplayBuffer.add`."""
@@ -91,15 +101,18 @@ class PrioritizedReplayBuffer(ReplayBuffer):
 
     def _draw(self, batch_size: int) -> tuple[Index, np.ndarray]:
         """:return: time steps and environments of B transitions, (B,) their probabilities"""
-        of_times = self.priorities[: self.size()].sum(axis=1, dtype=np.float64)
-        ends = np.cumsum(of_times)
-        # One draw from each of B equal parts of the sum; first the time step, then the environment
+        blocks = self._priorities.reshape(-1, BLOCK)
+        of_blocks = blocks.sum(axis=1, dtype=np.float64)
+        ends = np.cumsum(of_blocks)
+        # One draw from each of B equal parts of the sum: first the block, then the place within
         draws = (np.arange(batch_size) + np.random.random(batch_size)) * (ends[-1] / batch_size)
-        times = np.minimum(np.searchsorted(ends, draws, side="right"), len(ends) - 1)
-        env_ends = np.cumsum(self.priorities[times], axis=1, dtype=np.float64)
-        rest = draws - (ends[times] - of_times[times])
-        envs = np.minimum((env_ends <= rest[:, None]).sum(axis=1), self.n_envs - 1)
-        return (times, envs), self.priorities[times, envs] / ends[-1]
+        block = np.minimum(np.searchsorted(ends, draws, side="right"), len(ends) - 1)
+        rest = draws - (ends[block] - of_blocks[block])
+        places = np.cumsum(blocks[block], axis=1, dtype=np.float64)
+        flat = block * BLOCK + (places <= rest[:, None]).sum(axis=1)
+        # Rounding may lead beyond the last transition
+        flat = np.minimum(flat, self.size() * self.n_envs - 1)
+        return (flat // self.n_envs, flat % self.n_envs), self._priorities[flat] / ends[-1]
 
     def _observations_at(
         self, observations: np.ndarray | dict[str, np.ndarray], index: Index, env: VecNormalize | None
