@@ -9,6 +9,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import losses
+from sb3_chdp.common import buffers
 from sb3_chdp.common.buffers import PRIORITY_EPSILON, PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
 from tests.algorithms import FAST_CHDP
 from tests.hybrid_envs import HybridIdentityEnv
@@ -38,7 +39,9 @@ def numbers(batch):
 
 
 @pytest.mark.parametrize("alpha, beta", [(0.6, 0.4), (1.0, 1.0), (0.0, 0.5)])
-def test_frequencies_and_weights(alpha, beta):
+@pytest.mark.parametrize("block", [buffers.BLOCK, 7, 8], ids="block {}".format)
+def test_frequencies_and_weights(alpha, beta, block, monkeypatch):
+    monkeypatch.setattr(buffers, "BLOCK", block)
     buffer = filled_buffer(alpha=alpha, beta=beta)
     errors = np.random.default_rng(0).normal(size=(10, 4)) ** 3
     set_errors(buffer, errors)
