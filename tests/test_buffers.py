@@ -12,7 +12,7 @@ from sb3_chdp.chdp import losses
 from sb3_chdp.common import buffers
 from sb3_chdp.common.buffers import PRIORITY_EPSILON, PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
 from tests.algorithms import FAST_CHDP
-from tests.hybrid_envs import HybridIdentityEnv
+from tests.hybrid_envs import HybridIdentityEnv, make_layout_env
 
 BOX = spaces.Box(-np.inf, np.inf, (2,))
 
@@ -129,6 +129,13 @@ def test_chdp_sets_priorities_to_the_errors_of_its_critics(tmp_path):
     loaded.load_replay_buffer(tmp_path / "buffer")
     np.testing.assert_array_equal(loaded.replay_buffer.priorities, buffer.priorities)
     loaded.learn(20, reset_num_timesteps=False)
+
+
+def test_chdp_prioritises_transitions_with_dict_observations():
+    env = make_layout_env(observation_space=spaces.Dict(vector=spaces.Box(-1, 1, (2,))))
+    model = CHDP("MultiInputPolicy", env, **FAST_CHDP, prioritized_replay=True).learn(60)
+    assert isinstance(model.replay_buffer, PrioritizedDictReplayBuffer)
+    assert len(np.unique(model.replay_buffer.priorities[:60])) > 10, "they are updated"
 
 
 def test_prioritized_replay_excludes_other_buffers():
