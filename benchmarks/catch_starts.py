@@ -2,7 +2,7 @@
 What a model of CHDP lacks on Catch Point: success by the distance of the target at the start.
 
     python benchmarks/catch_starts.py                     the published model
-    python benchmarks/catch_starts.py --model benchmarks/results/main/chdp/CatchPoint-v0/seed_30.zip
+    python benchmarks/catch_starts.py --model benchmarks/results/main/chdp/CatchPoint-v0/seed_40.zip
 
 "Within reach" are targets that straight pushes at once, then a catch, reach in 25 steps. "Extra steps" are those of successful
 episodes beyond that; a miss is a catch out of reach, the twelfth of which ends an episode.
