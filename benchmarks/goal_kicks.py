@@ -21,7 +21,7 @@ from cells import ROOT
 from sb3_chdp import CHDP
 
 KICKS = (0.0, 0.5, 1.0, 2.0, 4.0, 6.0)
-N_STARTS, N_KICKS = 20, 12
+N_STARTS, N_KICKS = 100, 12
 # Random kicks to (0 to 6, -15 to 15), how many of those that scored are tried again, and how often
 N_RANDOM_KICKS, N_RETRIED, RETRIALS = 200, 12, 10
 # A kick that moves the ball back and forth is no progress
@@ -104,9 +104,10 @@ def main() -> None:
     print("| " + " | ".join([*columns, *(f"kick to {v:g}: Q, then" for v in KICKS)]) + " |")
     print("|---|---|---|---|---|" + "---|" * len(KICKS))
     for low in range(-15, 15, 3):
-        successes, lengths = zip(*[play(model, env, y) for y in np.linspace(low, low + 3, N_STARTS)], strict=True)
+        heights = np.linspace(low, low + 3, N_STARTS)
+        successes, lengths = zip(*[play(model, env, y) for y in heights], strict=True)
         best = best_first_kick(model, env, low + 1.5, rng)
-        in_play = share_in_play(env, np.linspace(low, low + 3, 5 * N_STARTS))
+        in_play = share_in_play(env, heights)
         entries = []
         env._place_at_start(low + 1.5)
         q_values = kick_values(model, env._observation(), np.array(KICKS))
