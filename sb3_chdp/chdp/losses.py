@@ -2,6 +2,7 @@
 
 import torch as th
 
+from sb3_chdp.chdp.candidates import Candidates, policy_candidates, random_candidates
 from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.type_aliases import HybridReplaySamples
@@ -29,8 +30,37 @@ def relabel_latents(
     return replay_data, drifted.float().mean()
 
 
+@th.no_grad()
+def best_next_actions(
+    policy: CHDPPolicy, replay_data: HybridReplaySamples, n_candidates: int, n_random: int
+) -> tuple[th.Tensor, th.Tensor]:
+    """
+    The next actions of the critics' target, and what they are worth.
+
+    If random actions are among the candidates, the ones that the replay buffer remembers are too, and Q1 chooses: the highest
+    of so many min(Q1, Q2) would be an overestimated one.
+
+    :param policy: the networks
+    :param replay_data: a batch, with next actions if ``n_random`` > 0
+    :param n_candidates: number of next actions that the target policies draw per transition
+    :param n_random: number of uniformly random ones that compete with these
+    :return: (B, 1 + Pmax + latent_dim) rows of the best ones, (B, 1) min(Q1, Q2) of the target critics
+    """
+    actor, critic = policy.actor_target, policy.critic_target
+    features = actor.features(replay_data.next_observations)
+    critic_features = critic.features(replay_data.next_observations)
+    candidates = policy_candidates(actor, features, n_candidates, policy.uniform_fraction)
+    if n_random > 0:
+        k, parameters = replay_data.next_discrete_actions, replay_data.next_parameters
+        assert k is not None and parameters is not None
+        remembered = Candidates(actor.codebook.representative_latents(k)[:, None], k[:, None], parameters[:, None])
+        candidates = candidates.join(remembered).join(random_candidates(actor, len(k), n_random, repeatable=False))
+    latents, k, parameters, q_values = candidates.best(critic, critic_features, chosen_by_q1=n_random > 0)
+    return th.cat([k[:, None].float(), parameters, latents], dim=1), q_values
+
+
 def critic_loss(
-    policy: CHDPPolicy, replay_data: HybridReplaySamples, n_target_candidates: int
+    policy: CHDPPolicy, replay_data: HybridReplaySamples, next_q_values: th.Tensor
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """
     Mean squared Bellman errors (eq. CHDP_critic_loss_overview), weighted if the replay is prioritised, with a gradient for
@@ -38,21 +68,15 @@ def critic_loss(
 
     :param policy: the networks
     :param replay_data: a batch
-    :param n_target_candidates: number of next actions drawn per transition, of which the best counts
+    :param next_q_values: (B, 1) values of the next actions, see :func:`best_next_actions`
     :return: their sum over both critics, the detached (B, 1) values of the first, and the larger (B,) absolute error of both
     """
-    critic, critic_target, actor_target = policy.critic, policy.critic_target, policy.actor_target
-    with th.no_grad():
-        # Next action of the target policies, and min over both target critics
-        next_features = actor_target.features(replay_data.next_observations)
-        next_critic_features = critic_target.features(replay_data.next_observations)
-        *_, next_q_values = policy.best_candidate(actor_target, next_features, next_critic_features, n_target_candidates)
-        target_q_values = replay_data.rewards + (1 - replay_data.dones) * replay_data.discounts * next_q_values
-    features = critic.features(replay_data.observations)
+    target_q_values = replay_data.rewards + (1 - replay_data.dones) * replay_data.discounts * next_q_values
+    features = policy.critic.features(replay_data.observations)
     # The gradient with respect to a latent is also that of its codeword, as if the one moved with the other
     codewords = policy.actor.codebook(replay_data.discrete_actions)
     latents = replay_data.latents + (codewords - codewords.detach())
-    q1, q2 = critic.q_values(features, latents, replay_data.parameters)
+    q1, q2 = policy.critic.q_values(features, latents, replay_data.parameters)
     errors = th.cat([q1, q2], dim=1) - target_q_values
     loss = (replay_data.weights * errors.square()).sum(dim=1).mean()
     return loss, q1.detach(), errors.detach().abs().amax(dim=1)
