@@ -89,14 +89,21 @@ def share_in_play(env: Any, heights: np.ndarray) -> float:
     return float(np.mean(in_play))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def model_and_env(description: str) -> tuple[CHDP, Any]:
+    """:return: the model and the environment, without its wrappers, that the command line names"""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="HardGoal-v0", choices=["Goal-v0", "HardGoal-v0"])
     parser.add_argument("--model", help="zip of a trained model (default: the published one)")
     args = parser.parse_args()
     model = CHDP.load(args.model or ROOT / "models" / "chdp" / f"{args.env}_1" / f"{args.env}.zip", device="cpu")
+    model.policy.set_training_mode(False)
     env = gym.make(args.env).unwrapped
     env.reset(seed=0)
+    return model, env
+
+
+def main() -> None:
+    model, env = model_and_env(__doc__)
     kick = [space.sample() for space in env.action_space[1]]
 
     rng = np.random.default_rng(0)

@@ -9,15 +9,12 @@ candidates; of the best that the search of deterministic predictions finds; and 
 A target far below the return means that critics cannot learn what the first action is worth.
 """
 
-import argparse
 from itertools import pairwise
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch as th
-from cells import ROOT
-from goal_kicks import MAX_STEPS, state_values
+from goal_kicks import MAX_STEPS, model_and_env, state_values
 
 from sb3_chdp import CHDP
 from sb3_chdp.chdp.losses import best_next_actions
@@ -49,15 +46,7 @@ def discounted_return(model: CHDP, env: Any) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", default="HardGoal-v0", choices=["Goal-v0", "HardGoal-v0"])
-    parser.add_argument("--model", help="zip of a trained model (default: the published one)")
-    args = parser.parse_args()
-    model = CHDP.load(args.model or ROOT / "models" / "chdp" / f"{args.env}_1" / f"{args.env}.zip", device="cpu")
-    model.policy.set_training_mode(False)
-    env: Any = gym.make(args.env).unwrapped
-    env.reset(seed=0)
-
+    model, env = model_and_env(__doc__)
     print("| start | play goes on, % | target | search | return |")
     print("|---|---|---|---|---|")
     for low, high in pairwise(EDGES):
