@@ -248,20 +248,22 @@ def test_alpha_normalises_by_q():
 
 def test_targets_move_by_tau():
     model = filled_model(tau=0.25)
-    before = [p.clone() for p in model._target_params]
+    update = model.update_targets
+    before = [p.clone() for p in update.target_params]
     model.train(1, 32)
-    for old, online, target in zip(before, model._online_params, model._target_params, strict=True):
+    for old, online, target in zip(before, update.params, update.target_params, strict=True):
         th.testing.assert_close(target, 0.75 * old + 0.25 * online.detach())
-    assert len(model._online_params) == len(model._target_params) == sum(len(p) for p in networks(model).values())
+    assert len(before) == sum(len(p) for p in networks(model).values())
 
 
 def test_policy_delay():
     model = filled_model(policy_delay=2)
-    before = [p.clone() for p in model._target_params]
+    targets = model.update_targets.target_params
+    before = [p.clone() for p in targets]
     model.train(1, 32)
-    assert all((a == b).all() for a, b in zip(before, model._target_params, strict=True))
+    assert all((a == b).all() for a, b in zip(before, targets, strict=True))
     model.train(1, 32)
-    assert any((a != b).any() for a, b in zip(before, model._target_params, strict=True))
+    assert any((a != b).any() for a, b in zip(before, targets, strict=True))
 
 
 def test_relabelling_of_latents():

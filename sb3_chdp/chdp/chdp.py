@@ -9,7 +9,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import get_parameters_by_name, update_learning_rate
+from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.codebook import codebook_usage
@@ -26,9 +26,10 @@ from sb3_chdp.chdp.losses import (
 )
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_chdp.common.buffers import PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
+from sb3_chdp.common.checks import check_at_least, check_fraction, check_one_of
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
-from sb3_chdp.common.utils import gradient_step, polyak_update
+from sb3_chdp.common.utils import TargetUpdate, gradient_step
 
 
 class CHDP(HybridOffPolicyAlgorithm):
@@ -223,23 +224,13 @@ class CHDP(HybridOffPolicyAlgorithm):
             seed=seed,
             device=device,
         )
-        if improvement_q not in IMPROVEMENT_QS:
-            raise ValueError(f"improvement_q must be one of {IMPROVEMENT_QS}, got {improvement_q!r}")
-        if improvement_parameters not in IMPROVEMENT_PARAMETERS:
-            raise ValueError(f"improvement_parameters must be one of {IMPROVEMENT_PARAMETERS}, got {improvement_parameters!r}")
-        if not 0 <= uniform_fraction <= 1:
-            raise ValueError(f"uniform_fraction must be between 0 and 1, got {uniform_fraction}")
-        for name, value, least in (
-            ("latent_dim", latent_dim, 1),
-            ("n_action_candidates", n_action_candidates, 1),
-            ("n_random_candidates", n_random_candidates, 0),
-            ("n_refinement_candidates", n_refinement_candidates, 0),
-            ("n_target_candidates", n_target_candidates, 1),
-            ("n_target_random_candidates", n_target_random_candidates, 0),
-            ("policy_delay", policy_delay, 1),
-        ):
-            if value < least:
-                raise ValueError(f"{name} must be at least {least}, got {value}")
+        check_one_of(IMPROVEMENT_QS, improvement_q=improvement_q)
+        check_one_of(IMPROVEMENT_PARAMETERS, improvement_parameters=improvement_parameters)
+        check_fraction(uniform_fraction=uniform_fraction)
+        check_at_least(1, latent_dim=latent_dim, policy_delay=policy_delay)
+        check_at_least(1, n_action_candidates=n_action_candidates, n_target_candidates=n_target_candidates)
+        check_at_least(0, n_random_candidates=n_random_candidates, n_refinement_candidates=n_refinement_candidates)
+        check_at_least(0, n_target_random_candidates=n_target_random_candidates)
         if prioritized_replay and (n_steps > 1 or replay_buffer_class is not None):
             raise ValueError(
                 f"prioritized_replay=True needs n_steps=1 and no replay_buffer_class, got {n_steps} and {replay_buffer_class}"
@@ -302,13 +293,7 @@ class CHDP(HybridOffPolicyAlgorithm):
             self.replay_buffer_class = PrioritizedDictReplayBuffer if with_dict else PrioritizedReplayBuffer
         super()._setup_model()
         self._create_aliases()
-        online, target = (self.actor, self.critic), (self.actor_target, self.critic_target)
-        # The features extractor may be shared: a dict counts it once
-        self._online_params = list(dict.fromkeys(p for net in online for p in net.parameters()))
-        self._target_params = list(dict.fromkeys(p for net in target for p in net.parameters()))
-        # Running mean and running var
-        self._batch_norm_stats = [stat for net in online for stat in get_parameters_by_name(net, ["running_"])]
-        self._batch_norm_stats_target = [stat for net in target for stat in get_parameters_by_name(net, ["running_"])]
+        self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -366,10 +351,7 @@ class CHDP(HybridOffPolicyAlgorithm):
                 self.actor.codebook.project()
                 losses |= {"continuous_loss": loss, "diffusion_loss_continuous": diffusion_loss}
 
-                polyak_update(self._online_params, self._target_params, self.tau)
-                # Copy running stats, see SB3's GH issue #996
-                if self._batch_norm_stats:
-                    polyak_update(self._batch_norm_stats, self._batch_norm_stats_target, 1.0)
+                self.update_targets(self.tau)
             for name, value in losses.items():
                 logs.setdefault(name, []).append(value.detach())
 
@@ -397,9 +379,8 @@ class CHDP(HybridOffPolicyAlgorithm):
             self.logger.record("train/codebook_learning_rate", rate)
 
     def _excluded_save_params(self) -> list[str]:
-        networks = ["actor", "critic", "actor_target", "critic_target"]
-        caches = ["_online_params", "_target_params", "_batch_norm_stats", "_batch_norm_stats_target"]
-        return [*super()._excluded_save_params(), *networks, *caches]
+        parts_of_policy = ["actor", "critic", "actor_target", "critic_target", "update_targets"]
+        return [*super()._excluded_save_params(), *parts_of_policy]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         state_dicts = ["policy", "critic.optimizer", "policy.discrete_optimizer", "policy.continuous_optimizer"]

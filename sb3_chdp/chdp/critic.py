@@ -8,6 +8,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
+from sb3_chdp.common.checks import check_at_least
+
 
 def chebyshev_features(x: th.Tensor, degree: int) -> th.Tensor:
     """
@@ -59,8 +61,7 @@ class HybridCritic(ContinuousCritic):
         parameter_degree: int = 1,
         bilinear: bool = False,
     ):
-        if parameter_degree < 1:
-            raise ValueError(f"parameter_degree must be at least 1, got {parameter_degree}")
+        check_at_least(1, parameter_degree=parameter_degree)
         action_dim = latent_dim + n_parameters * (parameter_degree + latent_dim * bilinear)
         super().__init__(
             observation_space,

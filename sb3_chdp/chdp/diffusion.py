@@ -10,6 +10,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_chdp.chdp.denoising import ChainMLP, DenoisingChain, StepConstants, denoise
+from sb3_chdp.common.checks import check_at_least, check_one_of
 
 
 def vp_beta_schedule(n_steps: int, beta_min: float = 0.1, beta_max: float = 10.0) -> np.ndarray:
@@ -56,12 +57,9 @@ class NoiseSchedule:
     """
 
     def __init__(self, n_steps: int, beta_schedule: str = "vp", variance_type: str = "fixed_large"):
-        if n_steps < 1:
-            raise ValueError(f"n_diffusion_steps must be at least 1, got {n_steps}")
-        if beta_schedule not in BETA_SCHEDULES:
-            raise ValueError(f"beta_schedule must be one of {sorted(BETA_SCHEDULES)}, got {beta_schedule!r}")
-        if variance_type not in VARIANCE_TYPES:
-            raise ValueError(f"variance_type must be one of {VARIANCE_TYPES}, got {variance_type!r}")
+        check_at_least(1, n_diffusion_steps=n_steps)
+        check_one_of(BETA_SCHEDULES, beta_schedule=beta_schedule)
+        check_one_of(VARIANCE_TYPES, variance_type=variance_type)
         self.n_steps = n_steps
         betas = BETA_SCHEDULES[beta_schedule](n_steps)
         alphas = 1 - betas

@@ -10,8 +10,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 
+from sb3_chdp.common.checks import check_policy_kwargs
 from sb3_chdp.common.hybrid_box import HybridBox
-from sb3_chdp.common.utils import check_policy_kwargs
 
 SelfHybridAlgorithm = TypeVar("SelfHybridAlgorithm", bound="HybridAlgorithm")
 

@@ -9,6 +9,8 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_chdp.common.checks import check_fraction
+
 # Added to every error, so that no transition is forgotten
 PRIORITY_EPSILON = 1e-3
 # Transitions whose priorities are summed up before the sums are searched
@@ -56,9 +58,7 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         super().__init__(*args, **kwargs)
         if self.optimize_memory_usage:
             raise ValueError(f"{type(self).__name__} does not support optimize_memory_usage=True")
-        for name, value in (("alpha", alpha), ("beta", beta)):
-            if not 0 <= value <= 1:
-                raise ValueError(f"{name} must be between 0 and 1, got {value}")
+        check_fraction(alpha=alpha, beta=beta)
         self.alpha, self.beta = alpha, beta
         # Of all places, whether filled or not, and zeros that complete the last block
         size = self.buffer_size * self.n_envs

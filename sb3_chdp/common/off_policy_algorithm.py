@@ -11,9 +11,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
+from sb3_chdp.common.checks import check_finite
 from sb3_chdp.common.policies import HybridPolicy
 from sb3_chdp.common.type_aliases import HybridReplaySamples, name_columns
-from sb3_chdp.common.utils import check_finite
 
 SelfHybridOffPolicyAlgorithm = TypeVar("SelfHybridOffPolicyAlgorithm", bound="HybridOffPolicyAlgorithm")
 

@@ -10,8 +10,8 @@ from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, Roll
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_chdp.common.checks import check_finite
 from sb3_chdp.common.hybrid_box import HybridBox
-from sb3_chdp.common.utils import check_finite
 
 
 class NativeActionVecEnv(VecEnvWrapper):

@@ -7,8 +7,8 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
 
+from sb3_chdp.common.checks import check_finite
 from sb3_chdp.common.hybrid_box import HybridBox
-from sb3_chdp.common.utils import check_finite
 
 
 class HybridPolicy(BasePolicy):

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_chdp.common.checks import check_one_of
 from sb3_chdp.common.space_tree import (
     DiscreteLeaf,
     Path,
@@ -66,8 +67,7 @@ class HybridActionSpec:
     """
 
     def __init__(self, space: spaces.Space, layout: str = "auto"):
-        if layout not in LAYOUTS:
-            raise ValueError(f"action_layout must be one of {LAYOUTS}, got {layout!r}")
+        check_one_of(LAYOUTS, action_layout=layout)
         self.space = space
         self.layout = layout
         if isinstance(space, spaces.OneOf):

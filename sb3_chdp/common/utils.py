@@ -1,28 +1,46 @@
 """Small helpers that the algorithms share."""
 
-import inspect
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
+from stable_baselines3.common.utils import get_parameters_by_name
+from torch import nn
 
 # Rows of a table that are searched at a time, and size of the groups that are told apart first; one divides the other
 NEAREST_ROW_CHUNK, NEAREST_ROW_GROUP = 2048, 128
 
 
-def polyak_update(params: Iterable[th.Tensor], target_params: Iterable[th.Tensor], tau: float) -> None:
+class TargetUpdate:
     """
-    SB3's ``polyak_update`` in one fused operation: target <- (1 - tau) * target + tau * parameter.
+    SB3's ``polyak_update`` of all target networks in one fused operation: target <- (1 - tau) * target + tau * parameter.
 
-    :param params: online parameters
-    :param target_params: target parameters, in the same order
-    :param tau: soft update coefficient in [0, 1]
+    Running statistics of batch normalisation are copied, see SB3's GH issue #996.
+
+    :param networks: the online networks, which may share parts
+    :param targets: their targets, in the same order, which share the same parts
     """
-    with th.no_grad():
-        th._foreach_lerp_(list(target_params), list(params), tau)
+
+    def __init__(self, networks: Sequence[nn.Module], targets: Sequence[nn.Module]):
+        self.params, self.batch_norm_stats = self._tensors(networks)
+        self.target_params, self.batch_norm_stats_target = self._tensors(targets)
+
+    @staticmethod
+    def _tensors(networks: Sequence[nn.Module]) -> tuple[list[th.Tensor], list[th.Tensor]]:
+        """:return: parameters, each once, and running statistics"""
+        params: dict[th.Tensor, None] = dict.fromkeys(p for net in networks for p in net.parameters())
+        return list(params), [stat for net in networks for stat in get_parameters_by_name(net, ["running_"])]
+
+    @th.no_grad()
+    def __call__(self, tau: float) -> None:
+        """
+        :param tau: soft update coefficient in [0, 1]
+        """
+        th._foreach_lerp_(self.target_params, self.params, tau)
+        if self.batch_norm_stats:
+            th._foreach_copy_(self.batch_norm_stats_target, self.batch_norm_stats)
 
 
 def gradient_step(loss: th.Tensor, optimizers: list[th.optim.Optimizer], max_grad_norm: float | None) -> None:
@@ -93,38 +111,3 @@ def hash_observations(observations: PyTorchObs) -> th.Tensor:
         total = total * 31 + (bits * factors).sum(dim=1)
     assert isinstance(total, th.Tensor)
     return (total ^ (total >> 29)).abs()
-
-
-def check_finite(name: str, value: np.ndarray | dict[str, np.ndarray]) -> None:
-    """
-    :param name: what the value is, for the message
-    :param value: array, or dict of arrays
-    :raises ValueError: if a float array holds NaN or infinity; the message names the environments concerned
-    """
-    if isinstance(value, dict):
-        for key, part in value.items():
-            check_finite(f"{name}[{key!r}]", part)
-        return
-    if value.dtype.kind == "f" and not np.isfinite(value).all():
-        rows = value.reshape(len(value), -1) if value.ndim > 1 else value[:, None]
-        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1)).tolist()
-        raise ValueError(f"{name} must be finite, got NaN or inf from environment(s) {bad}: {value[bad]}")
-
-
-def check_policy_kwargs(policy_class: type, policy_kwargs: dict[str, Any]) -> None:
-    """
-    :raises ValueError: if the policy has no such argument; the message lists those it has
-    """
-    accepted: set[str] = set()
-    # A class that passes **kwargs on accepts what its parent does
-    for parent in policy_class.__mro__:
-        parameters = inspect.signature(parent).parameters.values()
-        accepted |= {p.name for p in parameters if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)}
-        if not any(p.kind is p.VAR_KEYWORD for p in parameters):
-            break
-    accepted -= {"observation_space", "action_space", "lr_schedule", "self"}
-    unknown = set(policy_kwargs) - accepted
-    if unknown:
-        raise ValueError(
-            f"policy_kwargs has unknown key(s) {sorted(unknown)}; {policy_class.__name__} accepts {sorted(accepted)}"
-        )

@@ -15,9 +15,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
+from sb3_chdp.common.checks import check_finite
 from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox
 from sb3_chdp.common.on_policy_algorithm import HybridDictRolloutBuffer, HybridRolloutBuffer, NativeActionVecEnv
-from sb3_chdp.common.utils import check_finite
 from sb3_chdp.hppo.policies import CnnPolicy, HPPOPolicy, MlpPolicy, MultiInputPolicy
 
 SelfHPPO = TypeVar("SelfHPPO", bound="HPPO")

@@ -10,6 +10,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 
+from sb3_chdp.common.checks import check_at_least
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.td3 import HybridTD3
 from sb3_chdp.common.type_aliases import name_columns
@@ -118,9 +119,7 @@ class HyARTD3(HybridTD3):
             _init_setup_model=False,
             **kwargs,
         )
-        for name, value in (("embedding_dim", embedding_dim), ("parameter_latent_dim", parameter_latent_dim)):
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
+        check_at_least(1, embedding_dim=embedding_dim, parameter_latent_dim=parameter_latent_dim)
         self.embedding_dim = embedding_dim
         self.parameter_latent_dim = parameter_latent_dim
         self.representation_learning_rate = representation_learning_rate

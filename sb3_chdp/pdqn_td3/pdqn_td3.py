@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox
 from sb3_chdp.common.td3 import HybridTD3
-from sb3_chdp.common.utils import polyak_update
+from sb3_chdp.common.utils import TargetUpdate
 from sb3_chdp.pdqn_td3.policies import (
     CnnPolicy,
     MlpPolicy,
@@ -106,6 +106,7 @@ class PDQNTD3(HybridTD3):
     def _setup_model(self) -> None:
         super()._setup_model()
         self.actor_lr_schedule = FloatSchedule(self.actor_learning_rate)
+        self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
 
     def train(self, gradient_steps: int, batch_size: int = 128) -> None:
         # Switch to train mode (this affects batch norm / dropout)
@@ -135,15 +136,7 @@ class PDQNTD3(HybridTD3):
                 actor_loss.backward()
                 self.actor.optimizer.step()
 
-                polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
-                polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
-                # Copy running stats, see SB3's GH issue #996
-                for stats, target_stats in (
-                    (self.critic_batch_norm_stats, self.critic_batch_norm_stats_target),
-                    (self.actor_batch_norm_stats, self.actor_batch_norm_stats_target),
-                ):
-                    if stats:
-                        polyak_update(stats, target_stats, 1.0)
+                self.update_targets(self.tau)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/actor_learning_rate", actor_learning_rate)
@@ -173,6 +166,9 @@ class PDQNTD3(HybridTD3):
             features = self.critic.features(replay_data.observations)
         q1, _ = self.critic(features, self.actor(replay_data.observations))
         return -q1.sum(dim=1).mean()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "update_targets"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []

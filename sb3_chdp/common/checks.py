@@ -1,0 +1,74 @@
+"""Checks of arguments and data, whose errors name what was given and what is accepted."""
+
+import inspect
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+
+
+def check_at_least(least: int, **arguments: int) -> None:
+    """
+    :param least: smallest value that is accepted
+    :param arguments: values by name
+    :raises ValueError: for the first one that is below
+    """
+    for name, value in arguments.items():
+        if value < least:
+            raise ValueError(f"{name} must be at least {least}, got {value}")
+
+
+def check_fraction(**arguments: float) -> None:
+    """
+    :param arguments: values by name
+    :raises ValueError: for the first one that is not between 0 and 1
+    """
+    for name, value in arguments.items():
+        if not 0 <= value <= 1:
+            raise ValueError(f"{name} must be between 0 and 1, got {value}")
+
+
+def check_one_of(accepted: Collection[str], **arguments: str) -> None:
+    """
+    :param accepted: the values that are accepted
+    :param arguments: values by name
+    :raises ValueError: for the first one that is none of them
+    """
+    for name, value in arguments.items():
+        if value not in accepted:
+            raise ValueError(f"{name} must be one of {tuple(accepted)}, got {value!r}")
+
+
+def check_finite(name: str, value: np.ndarray | dict[str, np.ndarray]) -> None:
+    """
+    :param name: what the value is, for the message
+    :param value: array, or dict of arrays
+    :raises ValueError: if a float array holds NaN or infinity; the message names the environments concerned
+    """
+    if isinstance(value, dict):
+        for key, part in value.items():
+            check_finite(f"{name}[{key!r}]", part)
+        return
+    if value.dtype.kind == "f" and not np.isfinite(value).all():
+        rows = value.reshape(len(value), -1) if value.ndim > 1 else value[:, None]
+        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1)).tolist()
+        raise ValueError(f"{name} must be finite, got NaN or inf from environment(s) {bad}: {value[bad]}")
+
+
+def check_policy_kwargs(policy_class: type, policy_kwargs: dict[str, Any]) -> None:
+    """
+    :raises ValueError: if the policy has no such argument; the message lists those it has
+    """
+    accepted: set[str] = set()
+    # A class that passes **kwargs on accepts what its parent does
+    for parent in policy_class.__mro__:
+        parameters = inspect.signature(parent).parameters.values()
+        accepted |= {p.name for p in parameters if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)}
+        if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+            break
+    accepted -= {"observation_space", "action_space", "lr_schedule", "self"}
+    unknown = set(policy_kwargs) - accepted
+    if unknown:
+        raise ValueError(
+            f"policy_kwargs has unknown key(s) {sorted(unknown)}; {policy_class.__name__} accepts {sorted(accepted)}"
+        )
