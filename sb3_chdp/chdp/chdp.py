@@ -62,17 +62,14 @@ class CHDP(HybridOffPolicyAlgorithm):
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str), with a hybrid action space
-    :param learning_rate: learning rate for adam optimizer, the same for all networks;
-        it can be a function of the current progress remaining (from 1 to 0)
+    :param learning_rate: learning rate of all networks; it can be a function of the current progress remaining (from 1 to 0)
     :param buffer_size: size of the replay buffer
     :param learning_starts: how many steps of the model to collect transitions for before learning starts
     :param batch_size: Minibatch size for each gradient update
     :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
     :param gamma: the discount factor
-    :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
-        like ``(5, "step")`` or ``(2, "episode")``.
-    :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``)
-        Set to ``-1`` means to do as many gradient steps as steps done in the environment during the rollout.
+    :param train_freq: Update the model every ``train_freq`` steps, or a tuple like ``(5, "step")`` or ``(2, "episode")``
+    :param gradient_steps: How many gradient steps to do after each rollout; ``-1``: as many as steps done in the environment
     :param action_noise: noise on the scaled parameters, of size Pmax (None by default: the policies are stochastic)
     :param replay_buffer_class: Replay buffer class to use. If ``None``, it will be automatically selected.
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
@@ -84,12 +81,11 @@ class CHDP(HybridOffPolicyAlgorithm):
     :param variance_type: variance of a denoising step, "fixed_large" (the paper) or "fixed_small" (DDPM's posterior)
     :param eta: weight of the policy improvement terms relative to the diffusion losses
     :param improvement_q: which Q the policies ascend: "q1", "min" or "mean" of the two
-    :param improvement_parameters: parameters with which the discrete policy's latents are valued: "stored", those of the
-        action once taken, or "policy", those that the continuous policy draws for the latents
-    :param uniform_fraction: share of uniformly random discrete actions among those that the continuous policy is improved
-        for, and among the candidates
-    :param n_action_candidates: number of actions drawn per observation when acting; the one with the highest min(Q1, Q2)
-        of the target critics is taken
+    :param improvement_parameters: parameters that value the discrete policy's latents: "stored", those of the action once
+        taken, or "policy", those that the continuous policy draws for the latents
+    :param uniform_fraction: share of uniformly random discrete actions for which the continuous policy is improved, and of
+        those among the candidates
+    :param n_action_candidates: number of actions drawn per observation when acting; that of highest target min(Q1, Q2) is taken
     :param n_random_candidates: number of uniformly random actions that compete with these: a search for what the critics value
         and the policies have not found; best with ``layer_norm`` of :class:`CHDPPolicy` (0: the paper)
     :param n_refinement_candidates: number of variations of the best of these that compete with it in deterministic
@@ -101,8 +97,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         policies have not found (0: the paper; needs ``prioritized_replay``)
     :param prioritized_replay: whether transitions of large TD error are replayed more often, see
         :class:`PrioritizedReplayBuffer`, whose arguments ``replay_buffer_kwargs`` can hold (False: the paper)
-    :param relabel_latents: whether a stored latent that does not decode to the stored discrete action any more is
-        replaced by that action's present codeword
+    :param relabel_latents: whether stored latents that no longer decode to their action give way to its present codeword
     :param codebook_lr_factor: learning rate of the codebook relative to that of the networks; the faster it moves, the
         more stored latents decode to other actions (``train/latent_drift``)
     :param critics_train_codebook: whether the critics' loss trains the codebook too, so that actions of similar effect get
@@ -121,15 +116,12 @@ class CHDP(HybridOffPolicyAlgorithm):
     :param exploration_fraction: fraction of the training over which the rate of uniformly random actions is reduced
     :param exploration_initial_eps: initial probability of a uniformly random action
     :param exploration_final_eps: final probability of a uniformly random action
-    :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
-        the reported success rate, mean episode length, and mean reward over
+    :param stats_window_size: number of episodes over which the logged success rate, length and reward are averaged
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments to be passed to the policy on creation, see :class:`CHDPPolicy`
-    :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for
-        debug messages
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
     :param seed: Seed for the pseudo random generators
-    :param device: Device (cpu, cuda, ...) on which the code should be run.
-        Setting it to auto, the code will be run on the GPU if possible.
+    :param device: Device (cpu, cuda, ...) on which the code should be run; auto: the GPU if possible
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
 
