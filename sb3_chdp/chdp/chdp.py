@@ -85,7 +85,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         taken, or "policy", those that the continuous policy draws for the latents
     :param uniform_fraction: share of uniformly random discrete actions for which the continuous policy is improved, and of
         those among the candidates
-    :param n_action_candidates: number of actions drawn per observation when acting; that of highest target min(Q1, Q2) is taken
+    :param n_action_candidates: number of actions drawn per observation to act; that of highest target min(Q1, Q2) is taken
     :param n_random_candidates: number of uniformly random actions that compete with these: a search for what the critics value
         and the policies have not found; best with ``layer_norm`` of :class:`CHDPPolicy` (0: the paper)
     :param n_refinement_candidates: number of variations of the best of these that compete with it in deterministic
