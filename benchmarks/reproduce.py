@@ -41,6 +41,7 @@ PAPER_DEFAULTS = {
     "prioritized_replay": False,
     "codebook_lr_factor": 0.1,
     "n_target_candidates": 1,
+    "n_target_random_candidates": 0,
     "policy_kwargs": {"layer_norm": False, "parameter_degree": 1, "bilinear": False},
 }
 ABLATION = {
