@@ -18,7 +18,7 @@ $(STAMP): setup.cfg pyproject.toml constraints.txt
 	touch $(STAMP)
 
 train: $(STAMP)
-	$(BIN)/sb3-chdp train --env Platform-v0 --n-timesteps 40000 --log-folder logs --progress --verbose 0 --eval-freq -1
+	$(BIN)/sb3-chdp train --env Platform-v0 --log-folder logs --progress --verbose 0 --eval-freq -1
 	$(BIN)/sb3-chdp enjoy --env Platform-v0 --folder logs --no-render --n-timesteps 1000 | grep --invert-match "^Episode "
 
 test: $(STAMP)
