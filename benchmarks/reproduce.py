@@ -3,7 +3,8 @@ The paper's tables, with our own numbers (also ``sb3-chdp benchmark``).
 
     python benchmarks/reproduce.py main --jobs 2                         6 algorithms x 8 environments x 3 seeds
     python benchmarks/reproduce.py main --algos chdp --envs HardMove6-v0 --seeds 10 11 12
-    python benchmarks/reproduce.py ablation --jobs 2                     5 variants of CHDP x 2 environments
+    python benchmarks/reproduce.py ablation --jobs 2                     5 variants with the paper's settings x 2 environments
+    python benchmarks/reproduce.py ablation_tuned --jobs 2               4 with ours; the full one is in main
     python benchmarks/reproduce.py expressivity                          actions of the published models: expressivity.py
 
 Every cell appends its evaluations to results/<table>/<row>/<environment>/seed_<k>.csv and leaves its settings, versions and
@@ -27,8 +28,8 @@ from rich.table import Table
 
 from sb3_chdp.envs import ENV_IDS
 
-# Row of the ablation table: arguments of CHDP; all with the paper's default parameters, losses and critics, and without a
-# search beyond the policies' own draws, which would cover up what they lack
+# Of the ablation: the paper's default parameters, losses and critics, and no search beyond the policies' own draws, which may
+# cover up what they lack
 PAPER_DEFAULTS = {
     "n_diffusion_steps": 15,
     "eta": 10.0,
@@ -44,6 +45,7 @@ PAPER_DEFAULTS = {
     "n_target_random_candidates": 0,
     "policy_kwargs": {"layer_norm": False, "parameter_degree": 1, "bilinear": False},
 }
+# Row of both ablation tables: arguments of CHDP
 ABLATION = {
     "full": {},
     "without_diffusion": {"diffusion": False},
@@ -73,7 +75,10 @@ def make_cells(args: argparse.Namespace) -> list[Cell]:
             rows = [(algo, algo, overrides) for algo in args.algos]
             envs = args.envs or ENV_IDS
         else:
-            rows = [(name, "chdp", {**PAPER_DEFAULTS, **ABLATION[name], **overrides}) for name in args.variants]
+            tuned = args.table == "ablation_tuned"
+            base = {} if tuned else PAPER_DEFAULTS
+            variants = [name for name in args.variants if ABLATION[name] or not tuned]
+            rows = [(name, "chdp", {**base, **ABLATION[name], **overrides}) for name in variants]
             envs = args.envs or ABLATION_ENVS
         cells += [
             Cell(name, algo, env_id, seed, overrides=settings, **common) for env_id in envs for name, algo, settings in rows
@@ -104,9 +109,9 @@ def overview(cells: list[Cell], started: float) -> Table:
 
 def parse_args() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("table", choices=["main", "ablation", "expressivity"])
+    parser.add_argument("table", choices=["main", "ablation", "ablation_tuned", "expressivity"])
     parser.add_argument("--algos", nargs="+", default=list(ALGORITHMS), choices=list(ALGORITHMS), help="of the main table")
-    parser.add_argument("--variants", nargs="+", default=list(ABLATION), choices=list(ABLATION), help="of the ablation")
+    parser.add_argument("--variants", nargs="+", default=list(ABLATION), choices=list(ABLATION), help="of the ablations")
     parser.add_argument("--envs", nargs="+", choices=ENV_IDS, metavar="ENV", help=", ".join(ENV_IDS))
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--steps", type=int, help="environment steps (default: those of the YAML file)")

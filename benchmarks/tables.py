@@ -222,9 +222,12 @@ def main() -> None:
     runs = read_runs(args.results / "main")
     scores = scores_of(runs)
     parts = [markdown("main", scores), improvement(scores)]
-    ablation = read_runs(args.results / "ablation")
+    ablation, tuned = (read_runs(args.results / table) for table in ("ablation", "ablation_tuned"))
     if not ablation.empty:
-        parts += ["### Ablation", markdown("ablation", scores_of(ablation))]
+        parts += ["### Ablation with the paper's settings", markdown("ablation", scores_of(ablation))]
+    if not tuned.empty:
+        full = runs[(runs["row"] == "chdp") & runs["env"].isin(tuned["env"])].assign(row="full")
+        parts += ["### Ablation with our settings", markdown("ablation", scores_of(pd.concat([full, tuned])))]
     text = "\n\n".join(part for part in parts if part)
     print(text)
     if args.only_print:
