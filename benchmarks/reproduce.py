@@ -3,8 +3,8 @@ The paper's tables, with our own numbers (also ``sb3-chdp benchmark``).
 
     python benchmarks/reproduce.py main --jobs 2                         6 algorithms x 8 environments x 3 seeds
     python benchmarks/reproduce.py main --algos chdp --envs HardMove6-v0 --seeds 10 11 12
-    python benchmarks/reproduce.py ablation --jobs 2                     5 variants with the paper's settings x 2 environments
-    python benchmarks/reproduce.py ablation_tuned --jobs 2               4 with ours; the full one is in main
+    python benchmarks/reproduce.py ablation --jobs 2                     5 variants of CHDP x 2 environments, paper's settings
+    python benchmarks/reproduce.py ablation_tuned --jobs 2               the same with the settings of the YAML file
     python benchmarks/reproduce.py expressivity                          actions of the published models: expressivity.py
 
 Every cell appends its evaluations to results/<table>/<row>/<environment>/seed_<k>.csv and leaves its settings, versions and
@@ -75,10 +75,8 @@ def make_cells(args: argparse.Namespace) -> list[Cell]:
             rows = [(algo, algo, overrides) for algo in args.algos]
             envs = args.envs or ENV_IDS
         else:
-            tuned = args.table == "ablation_tuned"
-            base = {} if tuned else PAPER_DEFAULTS
-            variants = [name for name in args.variants if ABLATION[name] or not tuned]
-            rows = [(name, "chdp", {**base, **ABLATION[name], **overrides}) for name in variants]
+            base = PAPER_DEFAULTS if args.table == "ablation" else {}
+            rows = [(name, "chdp", {**base, **ABLATION[name], **overrides}) for name in args.variants]
             envs = args.envs or ABLATION_ENVS
         cells += [
             Cell(name, algo, env_id, seed, overrides=settings, **common) for env_id in envs for name, algo, settings in rows

@@ -222,12 +222,10 @@ def main() -> None:
     runs = read_runs(args.results / "main")
     scores = scores_of(runs)
     parts = [markdown("main", scores), improvement(scores)]
-    ablation, tuned = (read_runs(args.results / table) for table in ("ablation", "ablation_tuned"))
-    if not ablation.empty:
-        parts += ["### Ablation with the paper's settings", markdown("ablation", scores_of(ablation))]
-    if not tuned.empty:
-        full = runs[(runs["row"] == "chdp") & runs["env"].isin(tuned["env"])].assign(row="full")
-        parts += ["### Ablation with our settings", markdown("ablation", scores_of(pd.concat([full, tuned])))]
+    for table, whose in (("ablation", "the paper's"), ("ablation_tuned", "our")):
+        ablation = read_runs(args.results / table)
+        if not ablation.empty:
+            parts += [f"### Ablation with {whose} settings", markdown("ablation", scores_of(ablation))]
     text = "\n\n".join(part for part in parts if part)
     print(text)
     if args.only_print:

@@ -17,6 +17,7 @@ sys.path.insert(0, str(BENCHMARKS))
 import cells  # noqa: E402
 import dql_style  # noqa: E402
 import release  # noqa: E402
+import reproduce  # noqa: E402
 import tables  # noqa: E402
 import trials  # noqa: E402
 
@@ -107,6 +108,17 @@ def test_published_models_act_as_the_trained_ones(algo, tmp_path):
     for expected, action in zip(*(model.predict(obs, deterministic=True)[0] for model in (trained, published)), strict=True):
         assert expected[0] == action[0]
         np.testing.assert_array_equal(expected[1][expected[0]], action[1][action[0]])
+
+
+@pytest.mark.parametrize("table", ["ablation", "ablation_tuned"])
+def test_ablations_differ_in_their_settings(table, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["reproduce.py", table, "--seeds", "0"])
+    ablation = {(cell.name, cell.env_id): cell.settings() for cell in reproduce.make_cells(reproduce.parse_args())}
+    assert len(ablation) == len(tables.PAPER_ABLATION) * len(reproduce.ABLATION)
+    for env_id in tables.PAPER_ABLATION:
+        trained_with = cells.Cell("chdp", "chdp", env_id, 0, "").settings()
+        assert (ablation["full", env_id] == trained_with) == (table == "ablation_tuned")
+        assert not ablation["without_codebook", env_id]["codebook"]
 
 
 def test_the_papers_figures_are_complete():
