@@ -67,7 +67,9 @@ def main() -> None:
         if rows:
             kicks, value, following, q_value, scores = np.mean(rows, axis=0)
             share = f"{100 * len(rows) / N_STARTS:.0f}"
-            print(f"| {step} | {share} | {100 * kicks:.0f} | {value:.0f} | {following:.0f} | {q_value:.0f} | {100 * scores:.0f} |")
+            print(
+                f"| {step} | {share} | {100 * kicks:.0f} | {value:.0f} | {following:.0f} | {q_value:.0f} | {100 * scores:.0f} |"
+            )
 
 
 if __name__ == "__main__":
