@@ -18,7 +18,7 @@ from goal_kicks import MAX_STEPS, model_and_env, state_values
 from sb3_chdp import CHDP
 
 # Range of the starts, and their number
-LOW, HIGH, N_STARTS = -15.0, -12.0, 60
+LOW, HIGH, N_STARTS = -15.0, -12.0, 200
 N_SHOTS = 1000
 STEPS_SHOWN = (0, 1, 2, 3, 4, 5, 7, 10, 15, 20)
 
@@ -37,7 +37,7 @@ def best_shot(model: CHDP, obs: np.ndarray, rng: np.random.Generator) -> tuple[A
 
 
 def trace(model: CHDP, env: Any, y: float, rng: np.random.Generator) -> np.ndarray:
-    """:return: (steps, 5) per step: whether the agent kicks, value, discounted return, Q of the best shot, whether it scores"""
+    """:return: (steps, 5) whether the agent kicks, value, discounted return, Q of the best shot and whether it scores"""
     env._place_at_start(y)
     rows, rewards, over = [], [], False
     while not over and len(rows) < MAX_STEPS:
@@ -65,11 +65,10 @@ def main() -> None:
     for step in STEPS_SHOWN:
         rows = [values[step] for values in traces if len(values) > step]
         if rows:
-            kicks, value, following, q_value, scores = np.mean(rows, axis=0)
-            share = f"{100 * len(rows) / N_STARTS:.0f}"
-            print(
-                f"| {step} | {share} | {100 * kicks:.0f} | {value:.0f} | {following:.0f} | {q_value:.0f} | {100 * scores:.0f} |"
-            )
+            # Means: kicks, value, return, Q, scores
+            kicks, *values, scores = np.mean(rows, axis=0)
+            numbers = [100 * len(rows) / N_STARTS, 100 * kicks, *values, 100 * scores]
+            print(f"| {step} | " + " | ".join(f"{number:.0f}" for number in numbers) + " |")
 
 
 if __name__ == "__main__":
