@@ -66,8 +66,8 @@ def main() -> None:
         rows = [values[step] for values in traces if len(values) > step]
         if rows:
             # Means: kicks, value, return, Q, scores
-            kicks, *values, scores = np.mean(rows, axis=0)
-            numbers = [100 * len(rows) / N_STARTS, 100 * kicks, *values, 100 * scores]
+            kicks, *middle, scores = np.mean(rows, axis=0)
+            numbers = [100 * len(rows) / N_STARTS, 100 * kicks, *middle, 100 * scores]
             print(f"| {step} | " + " | ".join(f"{number:.0f}" for number in numbers) + " |")
 
 
