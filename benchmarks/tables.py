@@ -90,7 +90,7 @@ def interval(scores: np.ndarray) -> tuple[float, float, float]:
     """:return: interquartile mean and its 95 % bootstrap interval over seeds (rliable)"""
     data = {"x": np.asarray(scores)[:, None]}
     point, bounds = library.get_interval_estimates(
-        data, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=BOOTSTRAP_REPEATS
+        data, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=BOOTSTRAP_REPEATS, random_state=np.random.RandomState(0)
     )
     return float(point["x"][0]), float(bounds["x"][0, 0]), float(bounds["x"][1, 0])
 
@@ -155,7 +155,10 @@ def improvement(scores: pd.DataFrame) -> str:
         if min(len(ours), len(theirs)) < 3:
             continue
         point, bounds = library.get_interval_estimates(
-            {"x": (ours, theirs)}, metrics.probability_of_improvement, reps=BOOTSTRAP_REPEATS
+            {"x": (ours, theirs)},
+            metrics.probability_of_improvement,
+            reps=BOOTSTRAP_REPEATS,
+            random_state=np.random.RandomState(0),
         )
         low, high = np.ravel(bounds["x"])
         lines.append(f"| {env_id} | {float(np.ravel(point['x'])[0]):.2f} [{low:.2f}, {high:.2f}] |")
