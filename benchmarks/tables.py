@@ -10,6 +10,7 @@ seeds. Runs that are not complete do not count.
 
 import argparse
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib
@@ -86,12 +87,10 @@ def scores_of(runs: pd.DataFrame) -> pd.DataFrame:
     return last.join(groups[["timesteps", "gradient_steps", "seconds"]].max()).reset_index()
 
 
-def interval(scores: np.ndarray) -> tuple[float, float, float]:
-    """:return: interquartile mean and its 95 % bootstrap interval over seeds (rliable)"""
-    data = {"x": np.asarray(scores)[:, None]}
-    point, bounds = library.get_interval_estimates(
-        data, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=BOOTSTRAP_REPEATS, random_state=np.random.RandomState(0)
-    )
+def interval(data: np.ndarray | tuple[np.ndarray, np.ndarray], metric: Callable) -> tuple[float, float, float]:
+    """:return: a metric of (seeds, 1) scores and its 95 % bootstrap interval over seeds (rliable)"""
+    np.random.seed(0)  # the same files give the same tables; rliable ignores its argument random_state
+    point, bounds = library.get_interval_estimates({"x": data}, lambda *x: np.ravel(metric(*x)), reps=BOOTSTRAP_REPEATS)
     return float(point["x"][0]), float(bounds["x"][0, 0]), float(bounds["x"][1, 0])
 
 
@@ -114,7 +113,7 @@ def markdown(table: str, scores: pd.DataFrame) -> str:
             entry = mean_and_std(successes)
             if env_id == "Platform-v0":
                 entry += f" (return x 100: {mean_and_std(100 * cell['return'].to_numpy())})"
-            iqm, low, high = interval(successes)
+            iqm, low, high = interval(successes[:, None], metrics.aggregate_iqm)
             singles = ", ".join(f"{value:.1f}" for value in successes)
             lines.append(
                 f"| {env_id} | {NAMES[row]} | {entry} | {singles} | {iqm:.1f} [{low:.1f}, {high:.1f}] "
@@ -154,14 +153,8 @@ def improvement(scores: pd.DataFrame) -> str:
         )
         if min(len(ours), len(theirs)) < 3:
             continue
-        point, bounds = library.get_interval_estimates(
-            {"x": (ours, theirs)},
-            metrics.probability_of_improvement,
-            reps=BOOTSTRAP_REPEATS,
-            random_state=np.random.RandomState(0),
-        )
-        low, high = np.ravel(bounds["x"])
-        lines.append(f"| {env_id} | {float(np.ravel(point['x'])[0]):.2f} [{low:.2f}, {high:.2f}] |")
+        point, low, high = interval((ours, theirs), metrics.probability_of_improvement)
+        lines.append(f"| {env_id} | {point:.2f} [{low:.2f}, {high:.2f}] |")
     return "\n".join(lines) if len(lines) > 2 else ""
 
 
@@ -199,7 +192,7 @@ def plot_scores(scores: pd.DataFrame) -> None:
             successes = scores[(scores["env"] == env_id) & (scores["row"] == row)]["success"].to_numpy()
             if len(successes) == 0:
                 continue
-            iqm, low, high = interval(successes)
+            iqm, low, high = interval(successes[:, None], metrics.aggregate_iqm)
             axis.barh(index, high - low, left=low, color=f"C{index}", alpha=0.4)
             axis.plot(successes, [index] * len(successes), ".", color=f"C{index}")
             axis.plot([iqm, iqm], [index - 0.4, index + 0.4], color=f"C{index}")

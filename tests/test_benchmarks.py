@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
+from rliable import metrics
 from torch import nn
 
 from sb3_chdp.chdp.diffusion import DiffusionModel
@@ -86,6 +87,13 @@ def test_tables(tmp_path):
     expected = 100 * sum(row["success"] for row in make_cell(tmp_path, "chdp").rows()[-5:]) / 4
     assert scores[scores["row"] == "chdp"]["success"].item() == pytest.approx(expected)
     assert "94.2 ± 1.7" in tables.markdown("main", scores)
+
+
+def test_intervals_are_reproducible():
+    scores = np.random.default_rng(0).normal(90, 5, (20, 1))
+    iqm, low, high = tables.interval(scores, metrics.aggregate_iqm)
+    assert low < iqm < high
+    assert (iqm, low, high) == tables.interval(scores, metrics.aggregate_iqm)
 
 
 def test_log_of_trials(tmp_path):
