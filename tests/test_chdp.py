@@ -310,7 +310,8 @@ def test_two_seeded_runs_are_identical():
                dict(variance_type="fixed_small", beta_schedule="cosine"), dict(n_action_candidates=1),
                dict(improvement_parameters="stored", uniform_fraction=0), dict(n_target_candidates=4, n_random_candidates=4),
                dict(n_refinement_candidates=4), dict(prioritized_replay=True),
-               dict(max_grad_norm=None), dict(policy_kwargs=dict(layer_norm=True, parameter_degree=3, bilinear=True)),
+               dict(max_grad_norm=None), dict(policy_kwargs=dict(whitening=True)),
+               dict(policy_kwargs=dict(layer_norm=True, parameter_degree=3, bilinear=True)),
                dict(codebook_lr_factor=1.0, critics_train_codebook=True), dict(n_diffusion_steps=1), dict(uniform_fraction=1)],
     ids=str,
 )  # fmt: skip

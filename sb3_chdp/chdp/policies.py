@@ -28,6 +28,7 @@ from sb3_chdp.chdp.diffusion import DeterministicModel, DiffusionModel
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.policies import CnnFeatures, CombinedFeatures, HybridPolicy
 from sb3_chdp.common.spaces import HybridActionSpec
+from sb3_chdp.common.torch_layers import WhiteningExtractor
 from sb3_chdp.common.utils import default_optimizer_kwargs, hash_observations
 
 # Spread of the latents around a codeword in random actions
@@ -53,6 +54,8 @@ class CHDPPolicy(HybridPolicy):
     :param optimizer_kwargs: its keyword arguments, without the learning rate; ``fused=True`` for Adam if None
     :param share_features_extractor: whether both agents use the critic's features extractor, which then learns from the
         critic's loss alone; otherwise they have their own, which learns from the loss of the discrete policy
+    :param whitening: whether all networks see the whitened observations as well, see :class:`WhiteningExtractor`; for flat
+        observations only
     :param layer_norm: whether the critics have layer normalisation, see :class:`HybridCritic`; it steadies and speeds up
         learning with few discrete actions, and slows it down with many
     :param parameter_degree: highest degree of the Chebyshev polynomials of the parameters that the critics see (1: the
@@ -70,6 +73,7 @@ class CHDPPolicy(HybridPolicy):
         each of two rounds with standard deviations of 0.1 and 0.03 of the scaled parameters; in deterministic predictions only
     :param uniform_fraction: share of the drawn candidates whose discrete action is uniformly random
     :param exploration_noise: standard deviation of the exploration noise of policies without diffusion
+    :raises ValueError: if ``whitening`` comes with another features extractor than :class:`FlattenExtractor`
     """
 
     fixed_latent_noise: th.Tensor
@@ -88,6 +92,7 @@ class CHDPPolicy(HybridPolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
         share_features_extractor: bool = False,
+        whitening: bool = False,
         layer_norm: bool = False,
         parameter_degree: int = 1,
         bilinear: bool = False,
@@ -104,6 +109,11 @@ class CHDPPolicy(HybridPolicy):
     ):
         if optimizer_kwargs is None:
             optimizer_kwargs = default_optimizer_kwargs(optimizer_class)
+        if whitening and features_extractor_class is not FlattenExtractor:
+            raise ValueError(
+                "whitening=True is for flat observations, with features_extractor_class=FlattenExtractor, "
+                f"got {features_extractor_class.__name__}"
+            )
         super().__init__(
             observation_space,
             action_space,
@@ -117,6 +127,7 @@ class CHDPPolicy(HybridPolicy):
         self.net_arch = {"pi": [128, 128], "qf": [256, 256]} if net_arch is None else net_arch
         self.activation_fn = activation_fn
         self.share_features_extractor = share_features_extractor
+        self.whitening = whitening
         self.layer_norm = layer_norm
         self.parameter_degree = parameter_degree
         self.bilinear = bilinear
@@ -131,6 +142,9 @@ class CHDPPolicy(HybridPolicy):
         self.uniform_fraction = uniform_fraction
         self.exploration_noise = exploration_noise
         self._build(lr_schedule)
+
+    def make_features_extractor(self) -> BaseFeaturesExtractor:
+        return WhiteningExtractor(self.observation_space) if self.whitening else super().make_features_extractor()
 
     def _build(self, lr_schedule: Schedule) -> None:
         spec: HybridActionSpec = self.action_space.spec
@@ -308,6 +322,7 @@ class CHDPPolicy(HybridPolicy):
                 optimizer_class=self.optimizer_class,
                 optimizer_kwargs=self.optimizer_kwargs,
                 share_features_extractor=self.share_features_extractor,
+                whitening=self.whitening,
                 layer_norm=self.layer_norm,
                 parameter_degree=self.parameter_degree,
                 bilinear=self.bilinear,
