@@ -6,11 +6,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.torch_layers import (
-    BaseFeaturesExtractor,
-    FlattenExtractor,
-    get_actor_critic_arch,
-)
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, get_actor_critic_arch
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
@@ -25,10 +21,10 @@ from sb3_chdp.chdp.candidates import (
 from sb3_chdp.chdp.codebook import Codebook, OneHotCodebook
 from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.diffusion import DeterministicModel, DiffusionModel
+from sb3_chdp.chdp.whitening import WhiteningExtractor
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.policies import CnnFeatures, CombinedFeatures, HybridPolicy
 from sb3_chdp.common.spaces import HybridActionSpec
-from sb3_chdp.common.torch_layers import WhiteningExtractor
 from sb3_chdp.common.utils import default_optimizer_kwargs, hash_observations
 
 # Spread of the latents around a codeword in random actions

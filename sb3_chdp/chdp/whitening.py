@@ -1,12 +1,12 @@
-"""Features extractors that SB3 does not have."""
+"""The features extractor that lets CHDP's networks see small differences of observations."""
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
-# Statistics take in one training batch of so many, neighbouring ones are much alike, ...
+# One training batch of so many counts in the statistics, as neighbouring ones are much alike, ...
 BATCHES_PER_UPDATE = 16
-# ... with this weight, or as plain averages while these weigh more
+# ... with this weight; more at first, when they are plain averages
 MIN_UPDATE_WEIGHT = 0.004
 # Added to the variances in all directions, as a share of their mean: what varies far less stays small, noise above all
 SHRINKAGE = 0.01

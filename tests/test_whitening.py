@@ -6,7 +6,7 @@ import torch as th
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor
 
 from sb3_chdp import CHDP
-from sb3_chdp.common.torch_layers import BATCHES_PER_UPDATE, MAX_DEVIATION, SHRINKAGE, WhiteningExtractor
+from sb3_chdp.chdp.whitening import BATCHES_PER_UPDATE, MAX_DEVIATION, SHRINKAGE, WhiteningExtractor
 from tests.algorithms import FAST_CHDP, filled_model
 from tests.hybrid_envs import HybridIdentityEnv, box
 
