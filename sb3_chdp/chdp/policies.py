@@ -140,7 +140,9 @@ class CHDPPolicy(HybridPolicy):
         self._build(lr_schedule)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
-        return WhiteningExtractor(self.observation_space) if self.whitening else super().make_features_extractor()
+        if self.whitening:
+            return WhiteningExtractor(self.observation_space, **self.features_extractor_kwargs)
+        return super().make_features_extractor()
 
     def _build(self, lr_schedule: Schedule) -> None:
         spec: HybridActionSpec = self.action_space.spec
