@@ -50,8 +50,7 @@ class CHDPPolicy(HybridPolicy):
     :param optimizer_kwargs: its keyword arguments, without the learning rate; ``fused=True`` for Adam if None
     :param share_features_extractor: whether both agents use the critic's features extractor, which then learns from the
         critic's loss alone; otherwise they have their own, which learns from the loss of the discrete policy
-    :param whitening: whether all networks see the whitened observations as well, see :class:`WhiteningExtractor`; for flat
-        observations only
+    :param whitening: whether all networks see flat observations whitened as well, see :class:`WhiteningExtractor`
     :param layer_norm: whether the critics have layer normalisation, see :class:`HybridCritic`; it steadies and speeds up
         learning with few discrete actions, and slows it down with many
     :param parameter_degree: highest degree of the Chebyshev polynomials of the parameters that the critics see (1: the
