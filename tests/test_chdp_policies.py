@@ -15,6 +15,7 @@ from sb3_chdp.chdp.codebook import Codebook
 from sb3_chdp.chdp.critic import HybridCritic, chebyshev_features
 from sb3_chdp.common.utils import hash_observations
 from tests.algorithms import FAST_CHDP, filled_model
+from tests.fitting import unexplained
 from tests.hybrid_envs import LayoutEnv, box, make_layout_env
 
 
@@ -71,43 +72,34 @@ def test_chebyshev_features_are_cosines(degree):
 
 def test_critic_tells_apart_parameters_near_a_bound():
     """A peak of 1/30 of the range, 1/40 from the bound: degree 4 fits it within 200 steps, degree 1 does not."""
-    unexplained = []
+    left = []
     for degree in (1, 4):
         th.manual_seed(0)
         critic = make_critic(parameter_degree=degree, layer_norm=True)
-        optimizer = th.optim.Adam(critic.parameters(), lr=1e-3)
-        shares = []
-        for _ in range(200):
+
+        def batch(critic=critic):
             parameters = 2 * th.rand(256, 1) - 1
             target = th.exp(-(((parameters + 0.95) / 0.03) ** 2))
-            loss = (critic.q1_values(th.zeros(256, 2), th.zeros(256, 3), parameters) - target).square().mean()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            shares.append(loss.item() / target.var().item())
-        unexplained.append(np.mean(shares[150:]))
-    assert unexplained[0] > 0.4 and unexplained[1] < 0.1
+            return critic.q1_values(th.zeros(256, 2), th.zeros(256, 3), parameters), target
+
+        left.append(unexplained(critic.q_networks[0], batch, 200))
+    assert left[0] > 0.4 and left[1] < 0.1
 
 
 def test_critic_tells_apart_what_a_parameter_does():
     """Each of 64 discrete actions has its own factor of the parameter: products of both fit it within 300 steps."""
-    unexplained = []
+    left = []
     for bilinear in (False, True):
         th.manual_seed(0)
         critic = make_critic(latent_dim=32, bilinear=bilinear)
-        optimizer = th.optim.Adam(critic.parameters(), lr=1e-3)
         codewords, factors = 2 * th.rand(64, 32) - 1, th.randn(64, 1)
-        shares = []
-        for _ in range(300):
+
+        def batch(critic=critic, codewords=codewords, factors=factors):
             k, parameters = th.randint(64, (256,)), 2 * th.rand(256, 1) - 1
-            target = factors[k] * parameters
-            loss = (critic.q1_values(th.zeros(256, 2), codewords[k], parameters) - target).square().mean()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            shares.append(loss.item() / target.var().item())
-        unexplained.append(np.mean(shares[250:]))
-    assert unexplained[0] > 0.2 and unexplained[1] < 0.02
+            return critic.q1_values(th.zeros(256, 2), codewords[k], parameters), factors[k] * parameters
+
+        left.append(unexplained(critic.q_networks[0], batch, 300))
+    assert left[0] > 0.2 and left[1] < 0.02
 
 
 def test_parameter_degree_must_be_positive():

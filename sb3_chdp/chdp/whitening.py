@@ -17,10 +17,10 @@ MAX_DEVIATION = 5.0
 
 class WhiteningExtractor(FlattenExtractor):
     """
-    Flat observations s, and beside them whitened: W (s - mean), whose entries are uncorrelated and of unit variance.
+    Flat observations s, and beside them whitened: W (s - mean), whose entries are nearly uncorrelated and of unit variance.
 
     What decides is often a small difference of two entries, as the place of the ball relative to the player that runs with
-    it. Networks learn little of directions in which their inputs hardly vary; whitened, all vary alike. W is
+    it. Networks learn little of directions in which their inputs hardly vary; whitened, most vary alike. W is
     (covariance + ``SHRINKAGE`` * mean variance)^(-1/2): among all whitening matrices the one that keeps entries closest to the
     original ones (ZCA, Kessy et al., 2018), so that it changes little when the statistics do. These are averages over training
     batches, in buffers whose names begin with ``running_``, as in batch normalisation: targets take over a copy.
