@@ -4,10 +4,10 @@ What the critics of CHDP make of the states of episodes on Goal or Hard Goal, an
     python benchmarks/goal_values.py                      the published model of Hard Goal
     python benchmarks/goal_values.py --env Goal-v0 --model benchmarks/results/main/chdp/Goal-v0/seed_104.zip
 
-For the states of deterministic episodes, by the height of the start and the number of actions that follow until the end, the
-last one not counted: min(Q1, Q2) of the best of the target's own candidates, without what a replay buffer remembers; of the best
-that the search of deterministic predictions finds; and the discounted return. A target far below the search is one that does not
-find the action, a value far below the return one that does not resolve it; a value above the return puts off what scores.
+For the states of deterministic episodes, by the height of the start and the number of actions that follow the one taken there:
+min(Q1, Q2) of the best of the target's own candidates, without what a replay buffer remembers; of the best that the search of
+deterministic predictions finds; and the discounted return. A target far below the search is one that does not find the action,
+a value far below the return one that does not resolve it; a value above the return puts off what scores.
 """
 
 from collections import defaultdict
