@@ -36,7 +36,7 @@ def target_values(model: CHDP, obs: np.ndarray) -> np.ndarray:
     return th.stack(draws).mean(dim=0).numpy().ravel()
 
 
-def play(model: CHDP, env: Any, y: float) -> tuple[list[np.ndarray], list[float]]:
+def trace(model: CHDP, env: Any, y: float) -> tuple[list[np.ndarray], list[float]]:
     """:return: observations of an episode from this height and the discounted returns from there on"""
     env._place_at_start(y)
     observations, rewards, over = [], [], False
@@ -59,7 +59,7 @@ def main() -> None:
     for low, high in pairwise(EDGES):
         states = defaultdict(list)
         for y in np.linspace(low, high, N_STARTS):
-            episode = list(zip(*play(model, env, y), strict=True))
+            episode = list(zip(*trace(model, env, y), strict=True))
             for to_go, state in enumerate(reversed(episode)):
                 states[to_go].append(state)
         for to_go, entries in sorted(states.items()):
