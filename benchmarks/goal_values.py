@@ -5,9 +5,9 @@ What the critics of CHDP make of the states of episodes on Goal or Hard Goal, an
     python benchmarks/goal_values.py --env Goal-v0 --model benchmarks/results/main/chdp/Goal-v0/seed_104.zip
 
 For the states of deterministic episodes, by the height of the start and the number of actions that follow the one taken there:
-min(Q1, Q2) of the best of the target's own candidates, without what a replay buffer remembers; of the best that the search of
-deterministic predictions finds; and the discounted return. A target far below the search is one that does not find the action,
-a value far below the return one that does not resolve it; a value above the return puts off what scores.
+min(Q1, Q2) of the best of the target's candidates; of the best that the search of deterministic predictions finds; and the
+discounted return. A target far below the search is one that does not find the action, a value far below the return one that
+does not resolve it; a value above the return puts off what scores.
 """
 
 from collections import defaultdict
@@ -19,8 +19,7 @@ import torch as th
 from goal_kicks import MAX_STEPS, model_and_env, state_values
 
 from sb3_chdp import CHDP
-from sb3_chdp.chdp.losses import best_next_actions
-from sb3_chdp.common.type_aliases import HybridReplaySamples
+from sb3_chdp.chdp.losses import next_state_values
 
 EDGES = (-15.0, -13.5, -12.0, -9.0, -6.0, -3.0, 0.0, 3.0, 6.0, 9.0, 12.0, 13.5, 15.0)
 # Starts per range, how many states make an entry, and draws of the target's candidates
@@ -28,11 +27,9 @@ N_STARTS, MIN_STATES, N_DRAWS = 60, 10, 8
 
 
 def target_values(model: CHDP, obs: np.ndarray) -> np.ndarray:
-    """:return: (n,) values of n next observations in the target of the critics, without what a buffer remembers"""
-    nothing = th.zeros(len(obs), 0)
-    parts: dict[str, Any] = dict.fromkeys(HybridReplaySamples._fields, nothing) | dict(next_observations=th.as_tensor(obs))
-    data = HybridReplaySamples(**parts)
-    draws = [best_next_actions(model.policy, data, model.n_target_candidates, 0)[1] for _ in range(N_DRAWS)]
+    """:return: (n,) values of n next observations in the target of the critics"""
+    policy, n = model.policy, model.n_target_candidates
+    draws = [next_state_values(policy, th.as_tensor(obs), n) for _ in range(N_DRAWS)]
     return th.stack(draws).mean(dim=0).numpy().ravel()
 
 

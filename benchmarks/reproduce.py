@@ -42,7 +42,6 @@ PAPER_DEFAULTS = {
     "prioritized_replay": False,
     "codebook_lr_factor": 0.1,
     "n_target_candidates": 1,
-    "n_target_random_candidates": 0,
     "policy_kwargs": {"whitening": False, "layer_norm": False, "parameter_degree": 1, "bilinear": False},
 }
 # Row of both ablation tables: arguments of CHDP

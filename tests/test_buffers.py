@@ -114,7 +114,7 @@ def test_chdp_sets_priorities_to_the_errors_of_its_critics(tmp_path):
     buffer = model.replay_buffer
     assert isinstance(buffer, PrioritizedReplayBuffer) and buffer.alpha == 1
     data = model._sample_batch(16)
-    loss, _, errors = losses.critic_loss(model.policy, data, losses.best_next_actions(model.policy, data, 1, 0)[1])
+    loss, _, errors = losses.critic_loss(model.policy, data, 1)
     q1, q2 = model.critic.q_values(data.observations, data.latents, data.parameters)
     # Episodes of one step: the reward is the target
     both = th.cat([q1, q2], dim=1) - data.rewards
@@ -142,41 +142,3 @@ def test_prioritized_replay_excludes_other_buffers():
     for kwargs in (dict(n_steps=3), dict(replay_buffer_class=PrioritizedReplayBuffer)):
         with pytest.raises(ValueError, match="prioritized_replay"):
             CHDP("MlpPolicy", HybridIdentityEnv(), prioritized_replay=True, **kwargs)
-
-
-def test_next_actions_are_those_taken_until_better_ones_are_known():
-    buffer = filled_buffer(n_times=14)
-    # 14 time steps in 10 places: the last is at place 3, after which the oldest, 4, is at place 4
-    np.testing.assert_array_equal(buffer.next_actions[:3], buffer.actions[1:4])
-    np.testing.assert_array_equal(buffer.next_actions[3], buffer.actions[3], "what follows is not known yet")
-    np.testing.assert_array_equal(buffer.next_actions[4:-1], buffer.actions[5:])
-    np.testing.assert_array_equal(buffer.next_actions[-1], buffer.actions[0])
-
-    batch = buffer.sample(6)
-    np.testing.assert_array_equal(batch.next_actions, buffer.next_actions[buffer._last_batch])
-    before, better = buffer.next_actions.copy(), np.full((10, 4), False)
-    better[buffer._last_batch] = True
-    buffer.update_next_actions(th.full((6, 1), -7.0))
-    assert (buffer.next_actions[better] == -7).all()
-    np.testing.assert_array_equal(buffer.next_actions[~better], before[~better])
-
-
-def test_chdp_remembers_better_next_actions():
-    kwargs = dict(FAST_CHDP, prioritized_replay=True, n_target_random_candidates=4, learning_rate=0.0)
-    model = CHDP("MlpPolicy", make_layout_env(), **kwargs).learn(200)
-    buffer, policy, row_size = model.replay_buffer, model.policy, model.hybrid_space.spec.row_size
-    obs = th.as_tensor(buffer.next_observations[:199, 0])
-
-    def q1(rows):
-        latents = policy.actor_target.codebook.representative_latents(th.as_tensor(rows[:, 0]).long())
-        return policy.critic_target.q1_values(obs, latents, th.as_tensor(rows[:, 1:row_size])).detach()
-
-    taken, remembered = q1(buffer.actions[1:200, 0]), q1(buffer.next_actions[:199, 0])
-    # The critics do not change at this learning rate; a latent that was drawn may be worth more than its codeword
-    assert (remembered > taken).float().mean() > 4 * (remembered < taken).float().mean()
-    assert remembered.mean() > taken.mean() + 0.25 * taken.std()
-
-
-def test_random_next_actions_need_prioritized_replay():
-    with pytest.raises(ValueError, match="n_target_random_candidates > 0 needs prioritized_replay=True"):
-        CHDP("MlpPolicy", HybridIdentityEnv(), n_target_random_candidates=4)

@@ -43,18 +43,13 @@ def actions_of_continuous_loss(model, data):
     return losses.continuous_policy_loss(model.policy, data, features, features, *options)[2]
 
 
-def critic_loss_of(model, data):
-    n_next = (model.n_target_candidates, model.n_target_random_candidates)
-    return losses.critic_loss(model.policy, data, losses.best_next_actions(model.policy, data, *n_next)[1])
-
-
 def all_losses(model):
     data, policy, q = batch_of(model), model.policy, model.improvement_q
     features = (policy.actor_features(data.observations), model.critic.features(data.observations).detach())
     discrete = losses.discrete_policy_loss(policy, data, *features, q, model.improvement_parameters)
     continuous = losses.continuous_policy_loss(policy, data, *features, q, model.sequential_update, model.uniform_fraction)
     return {
-        "critic": critic_loss_of(model, data)[0],
+        "critic": losses.critic_loss(model.policy, data, model.n_target_candidates)[0],
         "discrete diffusion": discrete[0],
         "discrete improvement": discrete[1],
         "continuous diffusion": continuous[0],
@@ -192,10 +187,10 @@ def test_critic_target():
         y = data.rewards + 0.9 * (1 - data.dones) * th.min(q1, q2)
         ours = model.critic.q_values(data.observations, data.latents, data.parameters)
         expected = sum(F.mse_loss(q, y) for q in ours)
-    loss, q_values, _ = critic_loss_of(model, data)
+    loss, q_values, _ = losses.critic_loss(model.policy, data, 1)
     th.testing.assert_close(loss.detach(), expected)
     th.testing.assert_close(q_values, ours[0])
-    shorter = critic_loss_of(model, data._replace(discounts=th.full((32, 1), 0.1)))[0]
+    shorter = losses.critic_loss(model.policy, data._replace(discounts=th.full((32, 1), 0.1)), 1)[0]
     assert not th.isclose(shorter, loss)
 
 
@@ -204,29 +199,11 @@ def test_best_of_several_next_actions_counts():
     data = batch_of(model)
     seen, q_values = [], model.critic_target.q_values
     model.critic_target.q_values = lambda *args: seen.append(q_values(*args)) or seen[-1]
-    loss, *_ = critic_loss_of(model, data)
+    loss, *_ = losses.critic_loss(model.policy, data, 4)
     next_q = th.min(*seen[0]).view(32, 4).max(dim=1, keepdim=True).values
     y = data.rewards + 0.9 * (1 - data.dones) * next_q
     ours = model.critic.q_values(data.observations, data.latents, data.parameters)
     th.testing.assert_close(loss, sum(F.mse_loss(q, y) for q in ours))
-
-
-def test_remembered_next_actions_compete():
-    """Q1 chooses among the policies' action, the remembered one and three random ones, the smaller Q counts."""
-    model = filled_model(prioritized_replay=True, n_target_random_candidates=3)
-    data = batch_of(model)
-    seen, q_values = [], model.critic_target.q_values
-    model.critic_target.q_values = lambda *args: seen.append((args, q_values(*args))) or seen[-1][1]
-    rows, values = losses.best_next_actions(model.policy, data, 1, 3)
-    (_, latents, parameters), (q1, q2) = seen[0]
-    of_transition = parameters.view(32, 5, -1)
-    th.testing.assert_close(of_transition[:, 1], data.next_parameters)
-    best = q1.view(32, 5).argmax(dim=1, keepdim=True)
-    assert len(best.unique()) > 2
-    th.testing.assert_close(values, th.min(q1, q2).view(32, 5).gather(1, best))
-    row_size = model.hybrid_space.spec.row_size
-    th.testing.assert_close(rows[:, 1:row_size], of_transition[th.arange(32), best[:, 0]])
-    th.testing.assert_close(rows[:, row_size:], latents.view(32, 5, -1)[th.arange(32), best[:, 0]])
 
 
 def test_alpha_normalises_by_q():

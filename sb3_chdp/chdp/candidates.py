@@ -32,22 +32,17 @@ class Candidates(NamedTuple):
         batch_size = len(self.latents)
         return Candidates(*(th.cat([a, b.expand(batch_size, *b.shape[1:])], dim=1) for a, b in zip(self, others, strict=True)))
 
-    def best(
-        self, critic: HybridCritic, features: th.Tensor, chosen_by_q1: bool = False
-    ) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
+    def best(self, critic: HybridCritic, features: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
         """
         :param critic: twin critic
         :param features: (B, features_dim) its features of the observations
-        :param chosen_by_q1: whether Q1 chooses instead of min(Q1, Q2)
         :return: latents (B, latent_dim), discrete actions (B,), parameters (B, Pmax) and min(Q1, Q2) (B, 1) of the candidates
             for which the latter is highest
         """
         batch_size, n = self.discrete_actions.shape
         latents, k, parameters = (part.flatten(0, 1) for part in self)
-        q1, q2 = critic.q_values(features.repeat_interleave(n, dim=0), latents, parameters)
-        q_values = th.min(q1, q2)
-        choice = q1 if chosen_by_q1 else q_values
-        best = choice.view(batch_size, n).argmax(dim=1) + th.arange(batch_size, device=features.device) * n
+        q_values = th.min(*critic.q_values(features.repeat_interleave(n, dim=0), latents, parameters))
+        best = q_values.view(batch_size, n).argmax(dim=1) + th.arange(batch_size, device=features.device) * n
         return latents[best], k[best], parameters[best], q_values[best]
 
 

@@ -18,7 +18,6 @@ from sb3_chdp.chdp.exploration import vary_parts
 from sb3_chdp.chdp.losses import (
     IMPROVEMENT_PARAMETERS,
     IMPROVEMENT_QS,
-    best_next_actions,
     continuous_policy_loss,
     critic_loss,
     discrete_policy_loss,
@@ -55,8 +54,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         6. gradient norms are clipped, see ``max_grad_norm``;
         7. the critics' loss can train the codebook, which makes many discrete actions learnable, see
            ``critics_train_codebook`` (False: the paper);
-        8. transitions of large TD error can be replayed more often, see ``prioritized_replay`` (False: the paper), and
-           random next actions compete in the target, see ``n_target_random_candidates`` (0: the paper);
+        8. transitions of large TD error can be replayed more often, see ``prioritized_replay`` (False: the paper);
         9. codewords are kept in [-1, 1], where the latents are (not an argument: without it they drift away, and latents
            can no longer reach them).
 
@@ -92,9 +90,6 @@ class CHDP(HybridOffPolicyAlgorithm):
         predictions, in each of two rounds, see :class:`CHDPPolicy`: for parameters that have to be exact (0: the paper)
     :param n_target_candidates: number of next actions drawn per transition for the target of the critics, chosen from in
         the same way (1: the paper)
-    :param n_target_random_candidates: number of uniformly random next actions that compete with these, and with the best one
-        when the transition was in a batch before (the action taken, if it never was): over many batches a search of what the
-        policies have not found (0: the paper; needs ``prioritized_replay``)
     :param prioritized_replay: whether transitions of large TD error are replayed more often, see
         :class:`PrioritizedReplayBuffer`, whose arguments ``replay_buffer_kwargs`` can hold (False: the paper)
     :param relabel_latents: whether stored latents that no longer decode to their action give way to its present codeword
@@ -165,7 +160,6 @@ class CHDP(HybridOffPolicyAlgorithm):
         n_random_candidates: int = 0,
         n_refinement_candidates: int = 0,
         n_target_candidates: int = 1,
-        n_target_random_candidates: int = 0,
         prioritized_replay: bool = False,
         relabel_latents: bool = True,
         codebook_lr_factor: float = 0.1,
@@ -222,15 +216,9 @@ class CHDP(HybridOffPolicyAlgorithm):
         check_at_least(1, latent_dim=latent_dim, policy_delay=policy_delay)
         check_at_least(1, n_action_candidates=n_action_candidates, n_target_candidates=n_target_candidates)
         check_at_least(0, n_random_candidates=n_random_candidates, n_refinement_candidates=n_refinement_candidates)
-        check_at_least(0, n_target_random_candidates=n_target_random_candidates)
         if prioritized_replay and (n_steps > 1 or replay_buffer_class is not None):
             raise ValueError(
                 f"prioritized_replay=True needs n_steps=1 and no replay_buffer_class, got {n_steps} and {replay_buffer_class}"
-            )
-        if n_target_random_candidates > 0 and not prioritized_replay:
-            raise ValueError(
-                f"n_target_random_candidates > 0 needs prioritized_replay=True, whose replay buffer remembers next actions, "
-                f"got {n_target_random_candidates} and False"
             )
         self.latent_dim = latent_dim
         self.n_diffusion_steps = n_diffusion_steps
@@ -244,7 +232,6 @@ class CHDP(HybridOffPolicyAlgorithm):
         self.n_random_candidates = n_random_candidates
         self.n_refinement_candidates = n_refinement_candidates
         self.n_target_candidates = n_target_candidates
-        self.n_target_random_candidates = n_target_random_candidates
         self.prioritized_replay = prioritized_replay
         self.relabel_latents = relabel_latents
         self.codebook_lr_factor = codebook_lr_factor
@@ -306,13 +293,9 @@ class CHDP(HybridOffPolicyAlgorithm):
             replay_data, drift = relabel_latents(policy, self._sample_batch(batch_size), self.relabel_latents)
 
             # Step 0: critics, and the codebook if they train it
-            next_actions, next_q_values = best_next_actions(
-                policy, replay_data, self.n_target_candidates, self.n_target_random_candidates
-            )
-            loss, q_values, errors = critic_loss(policy, replay_data, next_q_values)
+            loss, q_values, errors = critic_loss(policy, replay_data, self.n_target_candidates)
             if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
                 self.replay_buffer.update_priorities(errors)
-                self.replay_buffer.update_next_actions(next_actions)
             also = codebook_optimizer if self.critics_train_codebook else []
             gradient_step(loss, [policy.critic.optimizer, *also], self.max_grad_norm)
             self.actor.codebook.project()

@@ -1,8 +1,8 @@
 """The losses of CHDP, one function for each of the paper's equations, and the relabelling of stored latents."""
 
 import torch as th
+from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_chdp.chdp.candidates import Candidates, policy_candidates, random_candidates
 from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.type_aliases import HybridReplaySamples
@@ -31,36 +31,20 @@ def relabel_latents(
 
 
 @th.no_grad()
-def best_next_actions(
-    policy: CHDPPolicy, replay_data: HybridReplaySamples, n_candidates: int, n_random: int
-) -> tuple[th.Tensor, th.Tensor]:
+def next_state_values(policy: CHDPPolicy, next_obs: PyTorchObs, n_candidates: int) -> th.Tensor:
     """
-    The next actions of the critics' target, and what they are worth.
-
-    If random actions are among the candidates, the ones that the replay buffer remembers are too, and Q1 chooses: the highest
-    of so many min(Q1, Q2) would be an overestimated one.
-
     :param policy: the networks
-    :param replay_data: a batch, with next actions if ``n_random`` > 0
-    :param n_candidates: number of next actions that the target policies draw per transition
-    :param n_random: number of uniformly random ones that compete with these
-    :return: (B, 1 + Pmax + latent_dim) rows of the best ones, (B, 1) min(Q1, Q2) of the target critics
+    :param next_obs: B next observations
+    :param n_candidates: number of next actions that the target policies draw per observation, of which the best counts
+    :return: (B, 1) min(Q1, Q2) of the target critics
     """
     actor, critic = policy.actor_target, policy.critic_target
-    features = actor.features(replay_data.next_observations)
-    critic_features = critic.features(replay_data.next_observations)
-    candidates = policy_candidates(actor, features, n_candidates, policy.uniform_fraction)
-    if n_random > 0:
-        k, parameters = replay_data.next_discrete_actions, replay_data.next_parameters
-        assert k is not None and parameters is not None
-        remembered = Candidates(actor.codebook.representative_latents(k)[:, None], k[:, None], parameters[:, None])
-        candidates = candidates.join(remembered).join(random_candidates(actor, len(k), n_random, repeatable=False))
-    latents, k, parameters, q_values = candidates.best(critic, critic_features, chosen_by_q1=n_random > 0)
-    return th.cat([k[:, None].float(), parameters, latents], dim=1), q_values
+    *_, q_values = policy.best_candidate(actor, actor.features(next_obs), critic.features(next_obs), n_candidates)
+    return q_values
 
 
 def critic_loss(
-    policy: CHDPPolicy, replay_data: HybridReplaySamples, next_q_values: th.Tensor
+    policy: CHDPPolicy, replay_data: HybridReplaySamples, n_target_candidates: int
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """
     Mean squared Bellman errors (eq. CHDP_critic_loss_overview), weighted if the replay is prioritised, with a gradient for
@@ -68,9 +52,10 @@ def critic_loss(
 
     :param policy: the networks
     :param replay_data: a batch
-    :param next_q_values: (B, 1) values of the next actions, see :func:`best_next_actions`
+    :param n_target_candidates: number of next actions drawn per transition, see :func:`next_state_values`
     :return: their sum over both critics, the detached (B, 1) values of the first, and the larger (B,) absolute error of both
     """
+    next_q_values = next_state_values(policy, replay_data.next_observations, n_target_candidates)
     target_q_values = replay_data.rewards + (1 - replay_data.dones) * replay_data.discounts * next_q_values
     features = policy.critic.features(replay_data.observations)
     # The gradient with respect to a latent is also that of its codeword, as if the one moved with the other

@@ -1,4 +1,4 @@
-"""Replay buffers that replay transitions of large TD error more often and remember next actions."""
+"""Replay buffers that replay transitions of large TD error more often."""
 
 import math
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ Index = tuple[np.ndarray, np.ndarray]
 
 
 class PrioritizedReplayBufferSamples(NamedTuple):
-    """SB3's ``ReplayBufferSamples``, the (B, 1) importance weights in (0, 1] and the remembered next actions."""
+    """SB3's ``ReplayBufferSamples`` and the (B, 1) importance weights in (0, 1]."""
 
     observations: PyTorchObs
     actions: th.Tensor
@@ -28,7 +28,6 @@ class PrioritizedReplayBufferSamples(NamedTuple):
     dones: th.Tensor
     rewards: th.Tensor
     weights: th.Tensor
-    next_actions: th.Tensor
     # For n-step replay buffers, which this is not
     discounts: None = None
 
@@ -39,9 +38,6 @@ class PrioritizedReplayBuffer(ReplayBuffer):
 
     New transitions count as the highest priority so far, until they have been sampled and
     :meth:`update_priorities` was called. The losses are to be weighted by (N P(i))^-beta, divided by the largest of the batch.
-
-    ``next_actions`` holds a good action for every next observation: at first the one that was taken there (before there is
-    one, and after a truncated episode, another one), then what :meth:`update_next_actions` was given.
 
     Source: Schaul et al. (2016), "Prioritized Experience Replay", https://arxiv.org/abs/1511.05952, proportional variant
     with stratified sampling; beta stays constant. In place of a sum tree, priorities are summed up anew for every batch: a
@@ -64,7 +60,6 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         size = self.buffer_size * self.n_envs
         self._priorities = np.zeros(math.ceil(size / BLOCK) * BLOCK, dtype=np.float32)
         self.max_priority = 1.0
-        self.next_actions = np.zeros_like(self.actions)
         self._last_batch: Index = (np.zeros(0, dtype=int), np.zeros(0, dtype=int))
 
     @property
@@ -74,10 +69,8 @@ class PrioritizedReplayBuffer(ReplayBuffer):
 
     def add(self, *args: Any, **kwargs: Any) -> None:
         """See :meth:`stable_baselines3.common.buffers.ReplayBuffer.add`."""
-        pos = self.pos
-        self.priorities[pos] = self.max_priority
+        self.priorities[self.pos] = self.max_priority
         super().add(*args, **kwargs)
-        self.next_actions[pos - 1] = self.next_actions[pos] = self.actions[pos]
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> PrioritizedReplayBufferSamples:  # type: ignore[override]
         """
@@ -96,7 +89,6 @@ class PrioritizedReplayBuffer(ReplayBuffer):
             dones=self.to_torch(self.dones[index] * (1 - self.timeouts[index])).reshape(-1, 1),
             rewards=self.to_torch(self._normalize_reward(self.rewards[index].reshape(-1, 1), env)),
             weights=self.to_torch((weights / weights.max()).astype(np.float32)).reshape(-1, 1),
-            next_actions=self.to_torch(self.next_actions[index]),
         )
 
     def update_priorities(self, errors: th.Tensor) -> None:
@@ -106,12 +98,6 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         priorities = (errors.abs().cpu().numpy() + PRIORITY_EPSILON) ** self.alpha
         self.priorities[self._last_batch] = priorities
         self.max_priority = max(self.max_priority, float(priorities.max()))
-
-    def update_next_actions(self, actions: th.Tensor) -> None:
-        """
-        :param actions: (B, action_dim) better actions for the next observations of the last batch
-        """
-        self.next_actions[self._last_batch] = actions.cpu().numpy()
 
     def _draw(self, batch_size: int) -> tuple[Index, np.ndarray]:
         """:return: time steps and environments of B transitions, (B,) their probabilities"""

@@ -14,7 +14,7 @@ class HybridReplaySamples(NamedTuple):
     A batch with the columns of its action rows named.
 
     Shapes: discrete_actions (B,) int64, parameters (B, Pmax) in [-1, 1] with padding 0, latents (B, latent_dim),
-    rewards, dones, discounts and weights (B, 1). The next actions are those that a prioritised buffer remembers.
+    rewards, dones, discounts and weights (B, 1).
     """
 
     observations: PyTorchObs
@@ -26,8 +26,6 @@ class HybridReplaySamples(NamedTuple):
     rewards: th.Tensor
     discounts: th.Tensor | float
     weights: th.Tensor | float = 1.0
-    next_discrete_actions: th.Tensor | None = None
-    next_parameters: th.Tensor | None = None
 
 
 def name_columns(
@@ -39,7 +37,6 @@ def name_columns(
     :param gamma: discount factor, used if the buffer gives none (n-step buffers do)
     """
     row_size = action_space.spec.row_size
-    next_actions = getattr(replay_data, "next_actions", None)
     return HybridReplaySamples(
         observations=replay_data.observations,
         discrete_actions=replay_data.actions[:, 0].long(),
@@ -50,6 +47,4 @@ def name_columns(
         rewards=replay_data.rewards,
         discounts=gamma if replay_data.discounts is None else replay_data.discounts,
         weights=getattr(replay_data, "weights", 1.0),
-        next_discrete_actions=None if next_actions is None else next_actions[:, 0].long(),
-        next_parameters=None if next_actions is None else next_actions[:, 1:row_size],
     )
