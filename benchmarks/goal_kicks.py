@@ -2,7 +2,7 @@
 What a model of CHDP knows about the first kick on Goal or Hard Goal, by the height of the start.
 
     python benchmarks/goal_kicks.py                       the published model of Hard Goal
-    python benchmarks/goal_kicks.py --env Goal-v0 --model benchmarks/results/main/chdp/Goal-v0/seed_80.zip
+    python benchmarks/goal_kicks.py --env Goal-v0 --model benchmarks/results/main/chdp/Goal-v0/seed_104.zip
 
 Prints success and length of episodes; how often the best of 200 random kicks, followed by the policy, scores: what better
 first kicks could gain; how often a kick to (0, 0) stays in play, whatever the model;

@@ -2,7 +2,7 @@
 Success of a model of CHDP on Goal or Hard Goal by the height of the start.
 
     python benchmarks/goal_starts.py                      the published model of Hard Goal
-    python benchmarks/goal_starts.py --model benchmarks/results/main/chdp/HardGoal-v0/seed_98.zip
+    python benchmarks/goal_starts.py --model benchmarks/results/main/chdp/HardGoal-v0/seed_113.zip
 
 Deterministic predictions from 2,000 starts evenly spaced, of which an evaluation draws 100 at random.
 """
