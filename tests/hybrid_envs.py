@@ -87,3 +87,39 @@ class HybridIdentityEnv(gym.Env):
         success = k == self.choice and abs(float(parameters[k][0]) - self.value) < 0.3
         obs, _ = self.reset()
         return obs, float(success), True, False, {"is_success": success}
+
+
+class HybridChainEnv(gym.Env):
+    """
+    Three decisions, and a reward for all of them at the end: a third for each right one.
+
+    A decision is right if the discrete action is that of the step and its parameter is at most 0.3 from the step's value.
+    The observation says which step it is and how many decisions were right so far. Learning from the rewards alone, without
+    the values of next states, gets the last decision right and leaves the others to chance, 0.15 each.
+    """
+
+    STEPS = ((0, 0.6), (1, -0.6), (0, -0.6))
+
+    def __init__(self):
+        self.action_space = spaces.Tuple((spaces.Discrete(2), spaces.Tuple([UNIT] * 2)))
+        self.observation_space = spaces.Box(0.0, 1.0, (len(self.STEPS) + 1,), dtype=np.float32)
+        self.t, self.n_right = 0, 0
+
+    def _obs(self) -> np.ndarray:
+        obs = np.zeros(len(self.STEPS) + 1, dtype=np.float32)
+        if self.t < len(self.STEPS):
+            obs[self.t] = 1.0
+        obs[-1] = self.n_right / len(self.STEPS)
+        return obs
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.t, self.n_right = 0, 0
+        return self._obs(), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
+        (k, parameters), (right_k, value) = action, self.STEPS[self.t]
+        self.n_right += bool(k == right_k and abs(float(parameters[k][0]) - value) <= 0.3)
+        self.t += 1
+        done = self.t == len(self.STEPS)
+        return self._obs(), self.n_right / len(self.STEPS) if done else 0.0, done, False, {}
