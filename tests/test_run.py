@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sb3_chdp import CHDP, FlattenHybridAction, check_hybrid_env
+from sb3_chdp import CHDP, PATD3, FlattenHybridAction, check_hybrid_env
 from tests.algorithms import LAYOUTS, OFF_POLICY_ALGORITHMS, has_learnt, make_model, snapshot
 from tests.hybrid_envs import LayoutEnv, box, layouts, make_layout_env
 
@@ -40,19 +40,30 @@ def test_raw_env(algorithm, layout):
         assert lengths == [10, 10] and np.isfinite(rewards).all()
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("vec_env_cls, n_envs", [(DummyVecEnv, 4), (SubprocVecEnv, 1), (SubprocVecEnv, 4)])
-def test_vec_envs(algorithm, layout, vec_env_cls, n_envs):
+def run_in_vec_env(algorithm, layout, vec_env_cls, n_envs):
     env_kwargs = dict(env_kwargs={"layout": layout}, vec_env_cls=vec_env_cls, seed=0)
     vec_env = make_vec_env(make_layout_env, n_envs, **env_kwargs)
     model = make_model(algorithm, vec_env).learn(40)
-    own_vec_env = make_vec_env(make_layout_env, n_envs, **env_kwargs)
-    obs = own_vec_env.reset()
-    actions = model.predict(obs)[0]
+    actions = model.predict(vec_env.reset())[0]
     assert len(actions) == n_envs
-    own_vec_env.step(actions)
-    own_vec_env.close()
+    vec_env.step(actions)
     vec_env.close()
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_vec_envs(algorithm, layout):
+    run_in_vec_env(algorithm, layout, DummyVecEnv, 4)
+
+
+@pytest.mark.parametrize("n_envs", [1, 4])
+def test_subprocesses(algorithm, n_envs):
+    run_in_vec_env(algorithm, "nested", SubprocVecEnv, n_envs)
+
+
+# All algorithms send actions in the same way
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_subprocesses_get_actions_of_every_layout(layout):
+    run_in_vec_env(PATD3, layout, SubprocVecEnv, 4)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
