@@ -4,6 +4,7 @@ import math
 from copy import copy
 from typing import TypeVar
 
+import numpy as np
 import torch as th
 from sb3_contrib.common.maskable.distributions import MaskableCategoricalDistribution, MaybeMasks
 from stable_baselines3.common.distributions import DiagGaussianDistribution
@@ -64,8 +65,8 @@ class HybridDistribution(DiagGaussianDistribution):
         :raises ValueError: for another number of masks
         """
         shape = self.categorical.distribution.logits.shape
-        if masks is not None and math.prod(masks.shape) != math.prod(shape):
-            raise ValueError(f"action_masks must have shape (n, K) = {tuple(shape)}, got {tuple(masks.shape)}")
+        if masks is not None and math.prod(np.shape(masks)) != math.prod(shape):
+            raise ValueError(f"action_masks must have shape (n, K) = {tuple(shape)}, got {tuple(np.shape(masks))}")
         self.categorical.apply_masking(masks)
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
