@@ -2,8 +2,8 @@ from pathlib import Path
 
 from sb3_chdp import envs  # registers the environments
 from sb3_chdp.chdp import CHDP
-from sb3_chdp.common.env_checker import check_hybrid_env
 from sb3_chdp.common.spaces import HybridActionSpec
+from sb3_chdp.env_checker import check_hybrid_env
 from sb3_chdp.hhqn_td3 import HHQNTD3
 from sb3_chdp.hppo import HPPO
 from sb3_chdp.hyar_td3 import HyARTD3

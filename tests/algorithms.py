@@ -21,6 +21,16 @@ def make_model(algorithm, env, policy="MlpPolicy", **kwargs):
     return algorithm(policy, env, **{"policy_kwargs": dict(net_arch=[8, 8]), "seed": 0, **SMALL[algorithm], **kwargs})
 
 
+def snapshot(model):
+    """:return: a copy of all parameters of the policy, by name"""
+    return {name: p.detach().clone() for name, p in model.policy.named_parameters()}
+
+
+def has_learnt(model, before):
+    """:return: whether any parameter has moved since the snapshot"""
+    return any((p != before[name]).any() for name, p in model.policy.named_parameters())
+
+
 FAST_CHDP = dict(
     n_diffusion_steps=3, latent_dim=4, batch_size=16, learning_starts=20, n_action_candidates=2, buffer_size=1000,
     policy_kwargs=dict(net_arch=[16, 16]), seed=0,

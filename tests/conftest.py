@@ -1,3 +1,5 @@
+import multiprocessing
+
 import pytest
 import torch as th
 
@@ -5,6 +7,8 @@ from tests.algorithms import ALGORITHMS, OFF_POLICY_ALGORITHMS
 
 # Small networks: more threads are slower, and tests may run side by side
 th.set_num_threads(1)
+# Else every environment of every SubprocVecEnv imports PyTorch anew
+multiprocessing.set_forkserver_preload(["stable_baselines3", "tests.hybrid_envs"])
 
 
 @pytest.fixture(params=ALGORITHMS, ids=lambda algorithm: algorithm.__name__)

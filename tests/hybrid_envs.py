@@ -87,3 +87,41 @@ class HybridIdentityEnv(gym.Env):
         success = k == self.choice and abs(float(parameters[k][0]) - self.value) < 0.3
         obs, _ = self.reset()
         return obs, float(success), True, False, {"is_success": success}
+
+
+class HybridChainEnv(gym.Env):
+    """
+    Three decisions, and one reward for all of them at the end: the mean of how good they were.
+
+    A decision is worth 0 with a wrong discrete action, else 1 less half the distance of its parameter from the best value.
+    The observation says which step it is and what the decisions so far were worth. Learning from rewards alone, without the
+    values of next states, gets the last decision right and leaves the others to chance.
+    """
+
+    # The right discrete action and the best value of its parameter
+    STEPS = ((2, 0.5), (0, -0.5), (1, 0.5))
+
+    def __init__(self):
+        self.action_space = spaces.Tuple((spaces.Discrete(3), spaces.Tuple([UNIT] * 3)))
+        self.observation_space = spaces.Box(0.0, 1.0, (len(self.STEPS) + 1,), dtype=np.float32)
+        self.t, self.worth = 0, 0.0
+
+    def _obs(self) -> np.ndarray:
+        obs = np.zeros(len(self.STEPS) + 1, dtype=np.float32)
+        if self.t < len(self.STEPS):
+            obs[self.t] = 1.0
+        obs[-1] = self.worth
+        return obs
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.t, self.worth = 0, 0.0
+        return self._obs(), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
+        (k, parameters), (right_k, value) = action, self.STEPS[self.t]
+        if k == right_k:
+            self.worth += (1 - abs(float(parameters[k][0]) - value) / 2) / len(self.STEPS)
+        self.t += 1
+        done = self.t == len(self.STEPS)
+        return self._obs(), self.worth if done else 0.0, done, False, {}

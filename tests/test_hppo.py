@@ -1,5 +1,7 @@
 """What is particular to HPPO: two ratios, masked densities, action masks."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch as th
@@ -99,13 +101,13 @@ def test_time_limits_bootstrap():
             obs, _, *rest = super().step(action)
             return (obs, 0.0, *rest)
 
-    model = make_model(HPPO, NoReward(layouts()["nested"]), gae_lambda=1.0, gamma=1.0)
+    # At this rate the value function stays what it is
+    model = make_model(HPPO, NoReward(layouts()["nested"]), gae_lambda=1.0, gamma=1.0, learning_rate=0.0)
     with th.no_grad():
         for parameter in model.policy.value_net.parameters():
             parameter.fill_(0.0)
         model.policy.value_net.bias.fill_(5.0)
-    model._setup_learn(10)
-    model.collect_rollouts(model.env, QuietCallback(model), model.rollout_buffer, model.n_steps)
+    model.learn(10)
     np.testing.assert_allclose(model.rollout_buffer.returns, 5.0, atol=1e-5)
 
 
@@ -140,7 +142,40 @@ def test_batch_size_of_one():
         make_model(HPPO, make_layout_env(), batch_size=1)
 
 
-def test_masks_of_the_wrong_shape(monkeypatch):
-    monkeypatch.setattr(MaskedEnv, "action_masks", lambda self: np.ones(2, dtype=bool))
+def test_masks_of_the_wrong_shape():
+    class TwoMasks(MaskedEnv):
+        def action_masks(self):
+            return np.ones(2, dtype=bool)
+
     with pytest.raises(ValueError, match=r"action_masks\(\) must give \(n_envs, K\) = \(1, 3\)"):
-        make_model(HPPO, MaskedEnv()).learn(10)
+        make_model(HPPO, TwoMasks()).learn(10)
+    with pytest.raises(ValueError, match=r"action_masks must have shape \(n, K\) = \(1, 3\)"):
+        make_model(HPPO, MaskedEnv()).predict(np.zeros(2, dtype=np.float32), action_masks=np.ones(2, dtype=bool))
+
+
+def test_masks_are_an_argument_and_no_state():
+    """Threads that share a model, each with its own mask, never get an action that theirs forbids."""
+    model = make_model(HPPO, MaskedEnv())
+    obs, masks = np.zeros((4, 2), dtype=np.float32), np.eye(3, dtype=bool)
+
+    def forbidden(i):
+        k = i % 3
+        actions = model.predict(obs, action_masks=np.tile(masks[k], (4, 1)))[0]
+        return sum(int(action[0]) != k for action in actions)
+
+    with ThreadPoolExecutor(8) as pool:
+        assert sum(pool.map(forbidden, range(2400))) == 0
+    # And the next one is free again
+    assert {int(action[0]) for action in model.predict(np.zeros((100, 2), dtype=np.float32))[0]} == {0, 1, 2}
+
+
+def test_forward_takes_masks():
+    model = make_model(HPPO, MaskedEnv())
+    rows, values, log_probs = model.policy(th.zeros(3, 2), action_masks=np.eye(3, dtype=bool))
+    assert rows[:, 0].tolist() == [0, 1, 2] and values.shape == (3, 1)
+    # Each had no choice
+    np.testing.assert_allclose(log_probs[:, 0].detach(), 0, atol=1e-6)
+    # The rows remember the masks
+    _, again, entropy = model.policy.evaluate_actions(th.zeros(3, 2), rows)
+    th.testing.assert_close(again, log_probs)
+    np.testing.assert_allclose(entropy.detach(), 0, atol=1e-6)

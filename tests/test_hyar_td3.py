@@ -6,7 +6,7 @@ import torch as th
 
 from sb3_chdp import HyARTD3
 from sb3_chdp.hyar_td3.representation import ActionBatch, ActionRepresentation
-from tests.algorithms import make_model
+from tests.algorithms import has_learnt, make_model, snapshot
 from tests.hybrid_envs import make_layout_env
 
 MASK = th.tensor([[True, True], [True, False], [False, False]])
@@ -125,34 +125,38 @@ def test_loss_against_a_slow_loop():
 
 def test_warm_up_is_counted_and_its_data_is_used():
     model = make_model(HyARTD3, make_layout_env(), learning_starts=50)
-    before = [p.clone() for p in model.policy.representation.parameters()]
+    before = snapshot(model)
     model.learn(50)
-    assert model.num_timesteps == 50 and model._n_updates == 0
-    assert np.isnan(model.replay_buffer.actions[:50, :, 3:]).all(), "latents of random actions are unknown"
-    model.learn(10, reset_num_timesteps=False)
-    assert any((p != q).any() for p, q in zip(model.policy.representation.parameters(), before, strict=True))
+    assert model.num_timesteps == 50 and not has_learnt(model, before)
+    latents = model.hybrid_space.columns.view(model.replay_buffer.actions[:50], "latents")
+    assert np.isnan(latents).all(), "latents of random actions are unknown"
+    model.learn(10, reset_num_timesteps=False, log_interval=1000)
+    assert any((p != before[f"representation.{name}"]).any() for name, p in model.policy.representation.named_parameters())
     assert model.policy.representation.usual_error > 0
-    assert model.num_timesteps == 60 and model._n_updates == 10
+    assert model.num_timesteps == 60 and model.logger.name_to_value["train/n_updates"] == 10
 
 
 def test_what_is_stored_is_what_was_done():
     """Stored latents decode, under the representation of then, to the stored action."""
     settings = dict(exploration_initial_eps=0, exploration_final_eps=0, learning_starts=0, gradient_steps=0)
     model = make_model(HyARTD3, make_layout_env(), exploration_noise=0.5, **settings).learn(40)
-    rows = th.as_tensor(model.replay_buffer.actions[:40, 0])
+    rows, columns = th.as_tensor(model.replay_buffer.actions[:40, 0]), model.hybrid_space.columns
     obs = th.as_tensor(model.replay_buffer.observations[:40, 0])
     representation = model.policy.representation
-    k = representation.nearest_action(rows[:, 3:6])
-    assert th.equal(k, rows[:, 0].long())
-    parameters, _ = representation.decode(obs, k, rows[:, 6:])
-    np.testing.assert_allclose(parameters.detach(), rows[:, 1:3], atol=1e-6)
+    embeddings, z = columns.view(rows, "latents").split([3, 2], dim=1)
+    k = representation.nearest_action(embeddings)
+    assert th.equal(k, columns.discrete_actions(rows))
+    parameters, _ = representation.decode(obs, k, z)
+    np.testing.assert_allclose(parameters.detach(), columns.view(rows, "parameters"), atol=1e-6)
 
 
-def test_representation_goes_on_after_loading(tmp_path):
-    model = make_model(HyARTD3, make_layout_env()).learn(30)
+def test_representation_is_not_warmed_up_again_after_loading(tmp_path):
+    model = make_model(HyARTD3, make_layout_env(), representation_freq=10**6).learn(30)
     model.save(tmp_path / "model")
-    loaded = HyARTD3.load(tmp_path / "model")
-    assert loaded._next_representation_update == model._next_representation_update > 0
+    loaded = HyARTD3.load(tmp_path / "model", env=make_layout_env())
+    before = snapshot(loaded)
+    loaded.learn(20, reset_num_timesteps=False)
+    assert has_learnt(loaded, before)
     for name, value in model.policy.representation.state_dict().items():
         assert th.equal(value, loaded.policy.representation.state_dict()[name]), name
 

@@ -65,8 +65,21 @@ def test_exploration_noise_schedule(name, final, initial, expected):
     )
     for progress, std in zip((1.0, 0.75, 0.2), expected, strict=True):
         assert model.exploration_noise_schedule(progress) == pytest.approx(std)
-        model._current_progress_remaining = progress
-        assert model._draw_noise(5000).std() == pytest.approx(std, rel=0.1)
+
+
+@pytest.mark.parametrize("name", [algorithm.__name__ for algorithm in OFF_POLICY_ALGORITHMS if algorithm is not CHDP])
+def test_exploration_noise_reaches_the_actions(name):
+    algorithm = next(algorithm for algorithm in OFF_POLICY_ALGORITHMS if algorithm.__name__ == name)
+    model = make_model(
+        algorithm, make_layout_env(), exploration_noise=0.2, exploration_initial_eps=0, exploration_final_eps=0,
+        learning_starts=0, gradient_steps=0,
+    ).learn(300)  # fmt: skip
+    buffer, columns = model.replay_buffer, model.hybrid_space.columns
+    done, meant = buffer.actions[:300, 0], model.policy.predict_rows(buffer.observations[:300, 0])
+    # What the actor puts out
+    part = next(part for part in ("latents", "scores", "parameters") if part in columns)
+    noise = columns.view(done, part) - columns.view(meant, part)
+    np.testing.assert_allclose(noise.std(axis=0), 0.2, rtol=0.2)
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])

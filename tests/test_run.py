@@ -18,8 +18,8 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sb3_chdp import CHDP, FlattenHybridAction, check_hybrid_env
-from tests.algorithms import LAYOUTS, OFF_POLICY_ALGORITHMS, make_model
+from sb3_chdp import CHDP, PATD3, FlattenHybridAction, check_hybrid_env
+from tests.algorithms import LAYOUTS, OFF_POLICY_ALGORITHMS, has_learnt, make_model, snapshot
 from tests.hybrid_envs import LayoutEnv, box, layouts, make_layout_env
 
 
@@ -35,34 +35,49 @@ def test_raw_env(algorithm, layout):
         assert state is None and env.action_space.contains(action)
         env.step(action)
         env.step(model.policy.predict(obs, deterministic=deterministic)[0])
-    assert evaluate_policy(model, env, 2, warn=False)[0] is not None
-    evaluate_policy(model.policy, Monitor(env), 2)
+    for evaluated in (model, model.policy):
+        rewards, lengths = evaluate_policy(evaluated, Monitor(env), 2, return_episode_rewards=True)
+        assert lengths == [10, 10] and np.isfinite(rewards).all()
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("vec_env_cls, n_envs", [(DummyVecEnv, 4), (SubprocVecEnv, 1), (SubprocVecEnv, 4)])
-def test_vec_envs(algorithm, layout, vec_env_cls, n_envs):
+def run_in_vec_env(algorithm, layout, vec_env_cls, n_envs):
     env_kwargs = dict(env_kwargs={"layout": layout}, vec_env_cls=vec_env_cls, seed=0)
     vec_env = make_vec_env(make_layout_env, n_envs, **env_kwargs)
     model = make_model(algorithm, vec_env).learn(40)
-    own_vec_env = make_vec_env(make_layout_env, n_envs, **env_kwargs)
-    obs = own_vec_env.reset()
-    actions = model.predict(obs)[0]
+    actions = model.predict(vec_env.reset())[0]
     assert len(actions) == n_envs
-    own_vec_env.step(actions)
-    own_vec_env.close()
+    vec_env.step(actions)
     vec_env.close()
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
+def test_vec_envs(algorithm, layout):
+    run_in_vec_env(algorithm, layout, DummyVecEnv, 4)
+
+
+@pytest.mark.parametrize("n_envs", [1, 4])
+def test_subprocesses(algorithm, n_envs):
+    run_in_vec_env(algorithm, "nested", SubprocVecEnv, n_envs)
+
+
+# All algorithms send actions in the same way
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_subprocesses_get_actions_of_every_layout(layout):
+    run_in_vec_env(PATD3, layout, SubprocVecEnv, 4)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
 def test_vec_wrappers(algorithm, layout):
-    wrappers = [VecNormalize, VecMonitor, lambda env: VecFrameStack(env, 2)]
-    if not isinstance(layouts()[layout], spaces.Dict):  # VecCheckNan refuses them
-        wrappers.append(lambda env: VecCheckNan(env, raise_exception=True))
-    for wrapper in wrappers:
+    for wrapper in (VecNormalize, VecMonitor, lambda env: VecFrameStack(env, 2)):
         env = wrapper(make_vec_env(make_layout_env, 2, env_kwargs={"layout": layout}))
         model = make_model(algorithm, env).learn(30)
         env.step(model.predict(env.reset())[0])
+
+
+def test_vec_check_nan_is_refused(algorithm):
+    env = VecNormalize(VecCheckNan(make_vec_env(make_layout_env, 2)))
+    with pytest.raises(ValueError, match="VecCheckNan can not look into hybrid actions"):
+        make_model(algorithm, env)
 
 
 @pytest.mark.parametrize("layout", ["nested", "dict", "one_of"])
@@ -117,8 +132,10 @@ def test_dict_and_image_observations(algorithm, policy, share_features_extractor
     ids=lambda kwargs: "-".join(kwargs),  # the same in every worker of pytest-xdist
 )
 def test_off_policy_options(off_policy_algorithm, kwargs):
-    model = make_model(off_policy_algorithm, make_layout_env(), **kwargs).learn(40)
-    assert model._n_updates > 0 and model.num_timesteps >= 40
+    model = make_model(off_policy_algorithm, make_layout_env(), **kwargs)
+    before = snapshot(model)
+    model.learn(40)
+    assert has_learnt(model, before) and model.num_timesteps >= 40
     if "n_steps" in kwargs:
         assert model.replay_buffer.sample(4).discounts is not None
 
@@ -134,8 +151,10 @@ def test_off_policy_options(off_policy_algorithm, kwargs):
 )
 def test_training_options(algorithm, kwargs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    model = make_model(algorithm, make_layout_env(), **kwargs).learn(40)
-    assert model._n_updates > 0 and model.num_timesteps >= 40
+    model = make_model(algorithm, make_layout_env(), **kwargs)
+    before = snapshot(model)
+    model.learn(40)
+    assert has_learnt(model, before) and model.num_timesteps >= 40
     if "tensorboard_log" in kwargs:
         assert list(tmp_path.glob(f"{algorithm.__name__}_1/events*"))
 

@@ -2,13 +2,15 @@ import pickle
 
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_chdp import HybridActionSpec
-from sb3_chdp.common.hybrid_box import HybridBox
-from sb3_chdp.common.spaces import HybridAction
+from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox, ScoreBox
+from sb3_chdp.common.rows import RowLayout
+from sb3_chdp.common.space_tree import children_of, get_part, leaves_of
 from tests.hybrid_envs import box, layouts
 
 
@@ -49,10 +51,20 @@ def hybrid_spaces(draw):
     return spaces.Tuple((discrete, draw(st.sampled_from(others)), spaces.Dict({"x": options[0], "y": box(-1, 1, 2)})))
 
 
-def active_parts(spec, action):
-    """Discrete parts and parameters of the chosen action: what a row must keep."""
-    row = spec.to_row(action)
-    return row, spec.to_native(row)
+def executed_boxes(space, is_shared, k):
+    """:return: (path in a native action, box) of the parameters of action k, which are what a row must keep"""
+    if isinstance(space, spaces.OneOf):
+        leaves = leaves_of(space.spaces[k], (1,))
+    elif is_shared:
+        leaves = leaves_of(space)
+    else:
+        rest = [(key, child) for key, child in children_of(space) if not isinstance(child, spaces.Discrete)]
+        options = [((key,), child) for key, child in rest]
+        if len(rest) == 1 and children_of(rest[0][1]) is not None:
+            options = [((rest[0][0], key), child) for key, child in children_of(rest[0][1])]
+        path, option = options[k]
+        leaves = leaves_of(option, path)
+    return [(path, leaf) for path, leaf in leaves if isinstance(leaf, spaces.Box)]
 
 
 @settings(max_examples=300, deadline=None)
@@ -69,17 +81,14 @@ def test_native_actions_are_in_the_space_and_round_trip(space, seed):
         np.testing.assert_equal(spec.to_native(spec.to_row(native)), native)
     for _ in range(4):
         sample = space.sample()
-        row, native = active_parts(spec, sample)
-        k = int(row[0])
+        row = spec.to_row(sample)
+        native, k = spec.to_native(row), int(row[0])
         assert space.contains(native)
         assert not row[1:][~spec.mask[k]].any()
         np.testing.assert_equal(spec.to_row(native)[0], k)
-        for leaf in spec._boxes[0 if spec.is_shared else k]:
-            path = leaf.path[1:] if isinstance(space, spaces.OneOf) else leaf.path
-            before, after = (sample[1], native[1]) if isinstance(space, spaces.OneOf) else (sample, native)
-            for key in path:
-                before, after = before[key], after[key]
-            width = float(np.max(leaf.space.high.astype(float) - leaf.space.low.astype(float), initial=0.0))
+        for path, leaf in executed_boxes(space, spec.is_shared, k):
+            width = float(np.max(leaf.high.astype(float) - leaf.low.astype(float), initial=0.0))
+            before, after = get_part(sample, path), get_part(native, path)
             np.testing.assert_allclose(after, before, rtol=0, atol=4e-16 * max(width, 1000))
 
 
@@ -186,11 +195,49 @@ def test_row_out_of_range():
         HybridActionSpec(layouts()["shared"]).to_native([3, 0, 0])
 
 
-def test_hybrid_action_is_a_tuple_for_others():
-    action = HybridActionSpec(layouts()["shared"]).to_native([2, 0.5, -0.5])
-    assert isinstance(action, tuple) and np.asarray([action, action]).shape == (2, 3)
-    assert type(pickle.loads(pickle.dumps(action))) is tuple
-    assert isinstance(action, HybridAction)
+@pytest.mark.parametrize("layout", layouts())
+def test_native_actions_are_of_the_types_of_the_space(layout):
+    """Plain tuples and dicts, which subprocesses can unpickle without this package."""
+    space = layouts()[layout]
+    (action,) = HybridActionSpec(space).to_native_batch(np.array([[2, 0.5, -0.5]]))
+    assert type(action) is type(space.sample())
+
+
+@pytest.mark.parametrize("layout", layouts())
+@pytest.mark.parametrize("kind", [HybridBox, ConcatenatedBox, ScoreBox])
+def test_rows_are_sampled_and_told_apart(layout, kind):
+    space = kind(layouts()[layout])
+    space.seed(0)
+    samples = np.stack([space.sample() for _ in range(200)])
+    assert all(space.contains(row) for row in samples) and samples.dtype == space.dtype
+    assert set(space.columns.discrete_actions(samples)) == set(range(space.spec.n_discrete_actions))
+    assert all(space.native.contains(action) for action in space.to_native(samples))
+    assert not space.contains(samples[0] * np.nan) and not space.contains(samples[0][1:])
+    if kind is not ScoreBox:
+        between = samples[0].copy()
+        space.columns.view(between, "discrete_actions")[:] = 1.27
+        assert not space.contains(between)
+
+
+def test_rows_with_masks():
+    space = ConcatenatedBox(layouts()["nested"], with_masks=True)
+    assert space.shape == (1 + 3 + 3,)
+    assert space.low.tolist() == [0, -1, -1, -1, 0, 0, 0] and space.high.tolist() == [2, 1, 1, 1, 1, 1, 1]
+    assert (space.columns.view(space.sample(), "masks") == 1).all()
+    assert pickle.loads(pickle.dumps(space)) == space != ConcatenatedBox(layouts()["nested"])
+
+
+@pytest.mark.parametrize("tensor", [np.array, th.tensor])
+def test_rows_are_packed_by_name(tensor):
+    columns = RowLayout(discrete_actions=1, parameters=2, latents=2)
+    k, parameters = tensor([2, 0]), tensor([[0.1, 0.2], [0.3, 0.4]])
+    rows = columns.pack(parameters=parameters, discrete_actions=k)
+    assert rows.shape == (2, columns.width) and rows[:, 0].tolist() == [2, 0]
+    assert columns.discrete_actions(rows).tolist() == [2, 0]
+    assert (columns.view(rows, "parameters") == parameters).all() and (columns.view(rows, "latents") == 0).all()
+    # Scores decide by the highest
+    scores = tensor([[0.1, 0.7, -1.0, 0.0], [0.5, -0.5, 0.2, 0.3]])
+    assert RowLayout(scores=3, parameters=1).discrete_actions(scores).tolist() == [1, 0]
 
 
 def test_hybrid_box_pickles_and_compares():

@@ -29,7 +29,8 @@ def test_pa_td3_equals_td3_on_the_flattened_environment(layout):
         th.manual_seed(1)
         model.train(6, 32)
     for mine, other in zip(ours.policy.parameters(), theirs.policy.parameters(), strict=True):
-        assert th.equal(mine, other)
+        # Up to rounding: all targets are updated in one operation
+        th.testing.assert_close(mine, other, rtol=0, atol=1e-6)
     obs = np.random.uniform(-1, 1, (5, 2)).astype(np.float32)
     np.testing.assert_allclose(ours.policy.predict_rows(obs), theirs.predict(obs)[0], atol=1e-6)
 

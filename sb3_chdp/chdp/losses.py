@@ -5,7 +5,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.policies import CHDPPolicy
-from sb3_chdp.common.type_aliases import HybridReplaySamples
+from sb3_chdp.common.samples import HybridReplaySamples
 
 IMPROVEMENT_QS = ("q1", "min", "mean")
 IMPROVEMENT_PARAMETERS = ("stored", "policy")

@@ -9,9 +9,11 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecCheckNan, VecEnv, is_vecenv_wrapped
 
 from sb3_chdp.common.checks import check_policy_kwargs
 from sb3_chdp.common.hybrid_box import HybridBox
+from sb3_chdp.common.native_env import NativeActionVecEnv
 
 SelfHybridAlgorithm = TypeVar("SelfHybridAlgorithm", bound="HybridAlgorithm")
 
@@ -23,11 +25,34 @@ class HybridAlgorithm(BaseAlgorithm):
     Mixin for SB3's algorithms, to be named before them.
 
     ``model.action_space`` is the user's space; environments and ``predict`` deal in native actions. Buffers and networks
-    deal in rows of numbers, see :class:`HybridBox`.
+    deal in rows of numbers, see :class:`HybridBox`. Rollouts step :meth:`native_env`, which converts the one to the other.
     """
 
     action_layout: str
     hybrid_space: HybridBox
+    # An array or a dict of arrays, which SB3's own annotations hand on where one of them is accepted
+    _last_obs: Any
+    _native_env: NativeActionVecEnv | None = None
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        vec_env = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        if is_vecenv_wrapped(vec_env, VecCheckNan):
+            raise ValueError(
+                "VecCheckNan can not look into hybrid actions, leave it out: training stops with an error at the first "
+                "observation or reward that is not finite, and actions always are"
+            )
+        return vec_env
+
+    def native_env(self, env: VecEnv) -> NativeActionVecEnv:
+        """
+        :param env: the training environment
+        :return: the same for rows instead of native actions
+        """
+        # Kept: SB3 collects rollouts of a single step, and a new wrapper asks all subprocesses for their render mode
+        if self._native_env is None or self._native_env.venv is not env:
+            self._native_env = NativeActionVecEnv(env, self.hybrid_space)
+        return self._native_env
 
     def _make_hybrid_space(self) -> HybridBox:
         """:return: the space of the rows that buffer and networks work with"""
@@ -52,7 +77,7 @@ class HybridAlgorithm(BaseAlgorithm):
         self.action_space.seed(None if self.seed is None else int(self.seed))
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "hybrid_space"]
+        return [*super()._excluded_save_params(), "hybrid_space", "_native_env"]
 
     @classmethod
     def load(

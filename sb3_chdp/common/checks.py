@@ -39,10 +39,10 @@ def check_one_of(accepted: Collection[str], **arguments: str) -> None:
             raise ValueError(f"{name} must be one of {tuple(accepted)}, got {value!r}")
 
 
-def check_finite(name: str, value: np.ndarray | dict[str, np.ndarray]) -> None:
+def check_finite(name: str, value: Any) -> None:
     """
     :param name: what the value is, for the message
-    :param value: array, or dict of arrays
+    :param value: array, or dict of arrays: observations or rewards of a vectorised environment
     :raises ValueError: if a float array holds NaN or infinity; the message names the environments concerned
     """
     if isinstance(value, dict):

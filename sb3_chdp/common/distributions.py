@@ -1,7 +1,10 @@
 """The distribution of hybrid actions: a categorical choice and a Gaussian over the parameters of all actions."""
 
+import math
+from copy import copy
 from typing import TypeVar
 
+import numpy as np
 import torch as th
 from sb3_contrib.common.maskable.distributions import MaskableCategoricalDistribution, MaybeMasks
 from stable_baselines3.common.distributions import DiagGaussianDistribution
@@ -17,7 +20,9 @@ class HybridDistribution(DiagGaussianDistribution):
     A categorical distribution of k beside a diagonal Gaussian of the P parameters of all actions.
 
     Only the parameters of the chosen action enter the density: the others are not executed. Actions are rows
-    ``[k | scaled parameters of all actions | mask of the K actions]``; the mask is there if the space has the columns.
+    ``[k | scaled parameters of all actions | masks]``; the masks are there if the space has the columns.
+
+    Unlike SB3's, it keeps no state: :meth:`proba_distribution` returns a new one, so that threads can share a policy.
 
     :param action_space: space of the action rows
     """
@@ -26,7 +31,7 @@ class HybridDistribution(DiagGaussianDistribution):
         spec = action_space.spec
         super().__init__(spec.n_parameters)
         self.n_discrete_actions = spec.n_discrete_actions
-        self.has_mask_columns = action_space.latent_dim > 0
+        self.columns = action_space.columns
         self.categorical = MaskableCategoricalDistribution(spec.n_discrete_actions)
         self._parameter_index = th.tensor(spec.parameter_index)
         self._parameter_mask = th.tensor(spec.mask, dtype=th.float32)
@@ -46,34 +51,36 @@ class HybridDistribution(DiagGaussianDistribution):
         """
         :param mean_actions: (B, K + P) logits and means
         :param log_std: (P,) log standard deviation
-        :return: self
+        :return: the distribution with these parameters
         """
         logits, means = mean_actions.split([self.n_discrete_actions, self.action_dim], dim=1)
-        self.categorical.proba_distribution(logits)
-        return super().proba_distribution(means, log_std)
+        distribution = copy(self)
+        distribution.categorical = MaskableCategoricalDistribution(self.n_discrete_actions)
+        distribution.categorical.proba_distribution(logits)
+        return DiagGaussianDistribution.proba_distribution(distribution, means, log_std)
 
     def apply_masking(self, masks: MaybeMasks) -> None:
         """
         :param masks: (B, K) False for discrete actions that may not be taken; None removes a former mask
+        :raises ValueError: for another number of masks
         """
+        shape = self.categorical.distribution.logits.shape
+        if masks is not None and math.prod(np.shape(masks)) != math.prod(shape):
+            raise ValueError(f"action_masks must have shape (n, K) = {tuple(shape)}, got {tuple(np.shape(masks))}")
         self.categorical.apply_masking(masks)
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
         """
-        :param actions: (B, columns) rows; their mask, if they have one, is applied
+        :param actions: (B, columns) rows; their masks, if they have the columns, are applied
         :return: (B, 2) log-probability of k, log-density of the parameters of k (0 if it has none)
         """
-        k, parameters, masks = self._split(actions)
-        if self.has_mask_columns:
-            self.apply_masking(masks)
+        k, parameters = self.columns.discrete_actions(actions), self.columns.view(actions, "parameters")
+        if "masks" in self.columns:
+            self.apply_masking(self.columns.view(actions, "masks"))
         index = self._parameter_index.to(k.device)[k]
         log_densities = self.distribution.log_prob(parameters).gather(1, index)
         own = self._parameter_mask.to(k.device)[k]
         return th.stack([self.categorical.log_prob(k), (log_densities * own).sum(dim=1)], dim=1)
-
-    def _split(self, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        first, last = 1, 1 + self.action_dim
-        return actions[:, 0].long(), actions[:, first:last], actions[:, last:]
 
     def entropy(self) -> th.Tensor:
         """:return: (B,) entropy of the categorical distribution; the Gaussian's is not part of HPPO's objective"""
@@ -88,8 +95,8 @@ class HybridDistribution(DiagGaussianDistribution):
         return self._rows(self.categorical.mode(), super().mode())
 
     def _rows(self, k: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-        parts = [k[:, None].float(), parameters]
-        if self.has_mask_columns:
+        parts = {"discrete_actions": k, "parameters": parameters}
+        if "masks" in self.columns:
             masks = self.categorical.distribution.masks
-            parts.append(th.ones(len(k), self.n_discrete_actions).to(k.device) if masks is None else masks.float())
-        return th.cat(parts, dim=1)
+            parts["masks"] = th.ones(len(k), self.n_discrete_actions, device=k.device) if masks is None else masks
+        return self.columns.pack(**parts)

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_chdp.common.rows import RowLayout
 from sb3_chdp.common.spaces import HybridActionSpec
 
 
@@ -17,14 +18,22 @@ class HybridBox(spaces.Box):
     :param latent_dim: width of what an algorithm stores behind the parameters
     """
 
-    def __init__(self, native: spaces.Space, layout: str = "auto", latent_dim: int = 0):
+    def __init__(self, native: spaces.Space[Any], layout: str = "auto", latent_dim: int = 0):
         self.native = native
         self.spec = HybridActionSpec(native, layout)
         self.latent_dim = latent_dim
-        high = np.ones(self.spec.row_size + latent_dim, dtype=np.float32)
+        self.columns = self._make_columns()
+        high = np.ones(self.columns.width, dtype=np.float32)
         low = -high
-        low[0], high[0] = 0, self.spec.n_discrete_actions - 1
+        if "discrete_actions" in self.columns:
+            self.columns.view(low, "discrete_actions")[:] = 0
+            self.columns.view(high, "discrete_actions")[:] = self.spec.n_discrete_actions - 1
+        if "masks" in self.columns:
+            self.columns.view(low, "masks")[:] = 0
         super().__init__(low, high, dtype=np.float32)
+
+    def _make_columns(self) -> RowLayout:
+        return RowLayout(discrete_actions=1, parameters=self.spec.max_parameters, latents=self.latent_dim)
 
     def to_native(self, rows: np.ndarray) -> list[Any]:
         """:return: n native actions of (n, columns) rows"""
@@ -32,9 +41,19 @@ class HybridBox(spaces.Box):
 
     def sample_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """:return: (n, columns) rows of uniformly random actions; the latents are for the algorithm to fill in"""
-        rows = np.zeros((n, *self.shape), dtype=np.float32)
-        rows[:, : self.spec.row_size] = self.spec.sample_rows(rng, n)
-        return rows
+        rows, columns = self.spec.sample_rows(rng, n), self.spec.columns
+        choices, parameters = columns.discrete_actions(rows), columns.view(rows, "parameters")
+        return self.columns.pack(discrete_actions=choices, parameters=parameters).astype(np.float32)
+
+    def sample(self, mask: None = None, probability: None = None) -> np.ndarray:
+        """:return: (columns,) row of a uniformly random action, see :meth:`sample_rows`"""
+        return self.sample_rows(self.np_random, 1)[0]
+
+    def contains(self, x: Any) -> bool:
+        """Whether x is a row inside the bounds; the index of the discrete action has to be a whole number."""
+        if not super().contains(x):
+            return False
+        return "scores" in self.columns or bool(self.columns.view(x, "discrete_actions") == self.columns.discrete_actions(x))
 
     def add_noise(self, rows: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """
@@ -42,9 +61,9 @@ class HybridBox(spaces.Box):
         :param noise: (n, Pmax) noise on the scaled parameters
         :return: the rows with noisy parameters, clipped, padding still 0
         """
-        columns = slice(1, self.spec.row_size)
         rows = rows.copy()
-        rows[:, columns] = np.clip(rows[:, columns] + noise, -1, 1) * self.spec.mask[rows[:, 0].astype(int)]
+        parameters = self.columns.view(rows, "parameters")
+        parameters[:] = np.clip(parameters + noise, -1, 1) * self.spec.mask[self.columns.discrete_actions(rows)]
         return rows
 
     def __eq__(self, other: Any) -> bool:
@@ -57,54 +76,55 @@ class HybridBox(spaces.Box):
 
 class ConcatenatedBox(HybridBox):
     """
-    The space of rows ``[k | scaled parameters of all actions | latent]``, for algorithms that put out the parameters of
+    The space of rows ``[k | scaled parameters of all actions | masks]``, for algorithms that put out the parameters of
     all actions at once.
 
     :param native: the user's action space
     :param layout: see :class:`HybridActionSpec`
-    :param latent_dim: width of what an algorithm stores behind the parameters
+    :param with_masks: whether there are K columns for which discrete actions were allowed (1) or not (0)
     """
 
-    def __init__(self, native: spaces.Space, layout: str = "auto", latent_dim: int = 0):
-        super().__init__(native, layout, latent_dim)
-        self.parameter_columns = slice(1, 1 + self.spec.n_parameters)
-        high = np.ones(self.parameter_columns.stop + latent_dim, dtype=np.float32)
-        low = -high
-        low[0], high[0] = 0, self.spec.n_discrete_actions - 1
-        spaces.Box.__init__(self, low, high, dtype=np.float32)
+    def __init__(self, native: spaces.Space[Any], layout: str = "auto", with_masks: bool = False):
+        self.with_masks = with_masks
+        super().__init__(native, layout)
+
+    def _make_columns(self) -> RowLayout:
+        masks = {"masks": self.spec.n_discrete_actions} if self.with_masks else {}
+        return RowLayout(discrete_actions=1, parameters=self.spec.n_parameters, **masks)
 
     def to_native(self, rows: np.ndarray) -> list[Any]:
-        return self.spec.to_native_batch(self.spec.own_parameters(rows[:, 0].astype(int), rows[:, self.parameter_columns]))
+        choices, parameters = self.columns.discrete_actions(rows), self.columns.view(rows, "parameters")
+        return self.spec.to_native_batch(self.spec.own_parameters(choices, parameters))
 
     def sample_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """:return: (n, columns) rows, k uniform over the actions, all parameters uniform in [-1, 1]"""
-        rows = np.zeros((n, *self.shape), dtype=np.float32)
-        rows[:, 0] = rng.integers(self.spec.n_discrete_actions, size=n)
-        rows[:, self.parameter_columns] = rng.uniform(-1.0, 1.0, (n, self.spec.n_parameters))
-        return rows
+        choices = rng.integers(self.spec.n_discrete_actions, size=n)
+        parameters = rng.uniform(-1.0, 1.0, (n, self.spec.n_parameters))
+        masks = {"masks": np.ones((n, self.spec.n_discrete_actions))} if self.with_masks else {}
+        return self.columns.pack(discrete_actions=choices, parameters=parameters, **masks).astype(np.float32)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.native, self.spec.layout, self.with_masks)
 
 
-class ScoreBox(HybridBox):
+class ScoreBox(ConcatenatedBox):
     """
-    The space [-1, 1]^(K + P) of algorithms whose actor gives a score to every discrete action.
-
-    Rows are ``[scores | scaled parameters of all actions]``, see :meth:`HybridActionSpec.rows_from_scores`.
+    The space [-1, 1]^(K + P) of rows ``[scores | scaled parameters of all actions]``, for algorithms whose actor gives a
+    score to every discrete action, of which the highest decides.
 
     :param native: the user's action space
     :param layout: see :class:`HybridActionSpec`
     """
 
-    def __init__(self, native: spaces.Space, layout: str = "auto"):
+    def __init__(self, native: spaces.Space[Any], layout: str = "auto"):
         super().__init__(native, layout)
-        size = self.spec.n_discrete_actions + self.spec.n_parameters
-        spaces.Box.__init__(self, -1.0, 1.0, (size,), dtype=np.float32)
 
-    def to_native(self, rows: np.ndarray) -> list[Any]:
-        return self.spec.to_native_batch(self.spec.rows_from_scores(rows))
+    def _make_columns(self) -> RowLayout:
+        return RowLayout(scores=self.spec.n_discrete_actions, parameters=self.spec.n_parameters)
 
     def sample_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """:return: (n, K + P) uniform scores and parameters; every discrete action is as likely as the others"""
-        return rng.uniform(-1.0, 1.0, (n, *self.shape)).astype(np.float32)
+        return rng.uniform(-1.0, 1.0, (n, self.columns.width)).astype(np.float32)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return ScoreBox, (self.native, self.spec.layout)
+        return type(self), (self.native, self.spec.layout)

@@ -7,13 +7,13 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
-from sb3_chdp.common.checks import check_finite
 from sb3_chdp.common.policies import HybridPolicy
-from sb3_chdp.common.type_aliases import HybridReplaySamples, name_columns
+from sb3_chdp.common.samples import HybridReplaySamples, name_columns
 
 SelfHybridOffPolicyAlgorithm = TypeVar("SelfHybridOffPolicyAlgorithm", bound="HybridOffPolicyAlgorithm")
 
@@ -62,9 +62,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         seed: int | None = None,
         device: th.device | str = "auto",
     ):
-        # Not super(): TD3 comes in between for the algorithms that share its train()
-        OffPolicyAlgorithm.__init__(
-            self,
+        super().__init__(
             policy,
             env,
             learning_rate,
@@ -122,37 +120,39 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
             progress_bar=progress_bar,
         )
 
-    def _sample_action(  # type: ignore[override]  # a list of native actions
+    def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """SB3's ``collect_rollouts``, in which actions are rows."""
+        return super().collect_rollouts(self.native_env(env), *args, **kwargs)
+
+    def _sample_action(
         self,
         learning_starts: int,
         action_noise: ActionNoise | None = None,
         n_envs: int = 1,
-    ) -> tuple[list[Any], np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray]:
         """
         :param learning_starts: number of steps with uniformly random actions only
         :param action_noise: noise that is added to what the policy puts out
         :param n_envs: number of environments
-        :return: native actions for the environments, (n_envs, columns) rows for the replay buffer
+        :return: (n_envs, columns) rows, the same for the environment and for the replay buffer
         """
         rng = self.action_space.np_random
         if self.num_timesteps < learning_starts:
             rows = self.policy.random_rows(rng, n_envs)
-            return self.hybrid_space.to_native(rows), rows
+            return rows, rows
         explores = rng.random(n_envs) < self.exploration_schedule(self._current_progress_remaining)
-        assert self._last_obs is not None, "self._last_obs was not set"
         noise = self._draw_noise(n_envs) if action_noise is None else action_noise()
         if noise is not None and np.size(noise) != n_envs * self.policy.noise_dim:
             raise ValueError(
                 f"action_noise must have size {self.policy.noise_dim} per environment, got shape {np.shape(noise)} "
                 f"for {n_envs} environment(s)"
             )
-        if noise is None:
-            rows = self.policy.predict_rows(self._last_obs)  # type: ignore[arg-type]
-        else:
-            rows = self.policy.noisy_rows(self._last_obs, noise)  # type: ignore[arg-type]
+        obs = self._last_obs
+        assert obs is not None, "self._last_obs was not set"
+        rows = self.policy.predict_rows(obs) if noise is None else self.policy.noisy_rows(obs, noise)
         if explores.any():
             rows[explores] = self._exploratory_rows(rows, rng)[explores]
-        return self.hybrid_space.to_native(rows), rows
+        return rows, rows
 
     def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """
@@ -167,20 +167,6 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
             return None
         std = self.exploration_noise_schedule(self._current_progress_remaining)
         return self.action_space.np_random.normal(0.0, std, (n_envs, self.policy.noise_dim))
-
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        # Before the buffer is touched: one NaN would ruin the networks for good
-        check_finite("The observation", new_obs)
-        check_finite("The reward", reward)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _on_step(self) -> None:
         super()._on_step()

@@ -21,7 +21,7 @@ class HybridPolicy(BasePolicy):
 
     action_space: HybridBox
 
-    def predict(  # type: ignore[override]
+    def predict(
         self,
         observation: np.ndarray | dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,
@@ -38,9 +38,7 @@ class HybridPolicy(BasePolicy):
         :return: one native action for one observation, a list of n native actions for n observations; and ``state``
         :raises ValueError: if the observation holds NaN or infinity
         """
-        rows, vectorized_env = self._predict_rows(observation, deterministic)
-        actions = self.action_space.to_native(rows)
-        return (actions if vectorized_env else actions[0]), state
+        return self._predict_native(observation, deterministic), state
 
     def predict_rows(self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool = False) -> np.ndarray:
         """
@@ -51,7 +49,15 @@ class HybridPolicy(BasePolicy):
         rows, vectorized_env = self._predict_rows(observation, deterministic)
         return rows if vectorized_env else rows[0]
 
-    def _predict_rows(self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool) -> tuple[np.ndarray, bool]:
+    def _predict_native(self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool, **kwargs: Any) -> Any:
+        """:return: native actions; further arguments are those of the subclass's ``_predict``"""
+        rows, vectorized_env = self._predict_rows(observation, deterministic, **kwargs)
+        actions = self.action_space.to_native(rows)
+        return actions if vectorized_env else actions[0]
+
+    def _predict_rows(
+        self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool, **kwargs: Any
+    ) -> tuple[np.ndarray, bool]:
         self.set_training_mode(False)
         # Common mistake, see https://github.com/DLR-RM/stable-baselines3/issues/1694
         if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
@@ -66,7 +72,7 @@ class HybridPolicy(BasePolicy):
             for name, part in parts.items():
                 check_finite(name, np.asarray(part) if vectorized_env else np.asarray(part)[None])
         with th.no_grad():
-            rows = self._predict(obs_tensor, deterministic=deterministic)
+            rows = self._predict(obs_tensor, deterministic=deterministic, **kwargs)
         return rows.cpu().numpy(), vectorized_env
 
     @property

@@ -22,12 +22,12 @@ class DiscreteLeaf(NamedTuple):
     """A discrete leaf, its digits (one for ``Discrete``, one per element otherwise) and their offset."""
 
     path: Path
-    space: spaces.Space
+    space: spaces.Space[Any]
     radices: tuple[int, ...]
     start: np.ndarray
 
 
-def children_of(space: spaces.Space) -> list[tuple[Any, spaces.Space]] | None:
+def children_of(space: spaces.Space[Any]) -> list[tuple[Any, spaces.Space[Any]]] | None:
     """:return: (key, child) pairs of a ``Tuple`` or ``Dict``, None for a leaf."""
     if isinstance(space, spaces.Tuple):
         return list(enumerate(space.spaces))
@@ -36,7 +36,7 @@ def children_of(space: spaces.Space) -> list[tuple[Any, spaces.Space]] | None:
     return None
 
 
-def leaves_of(space: spaces.Space, path: Path = ()) -> Iterator[tuple[Path, spaces.Space]]:
+def leaves_of(space: spaces.Space[Any], path: Path = ()) -> Iterator[tuple[Path, spaces.Space[Any]]]:
     children = children_of(space)
     if children is None:
         yield path, space
@@ -45,11 +45,11 @@ def leaves_of(space: spaces.Space, path: Path = ()) -> Iterator[tuple[Path, spac
         yield from leaves_of(child, (*path, key))
 
 
-def is_empty_discrete(space: spaces.Space) -> bool:
+def is_empty_discrete(space: spaces.Space[Any]) -> bool:
     return isinstance(space, spaces.Discrete) and space.n == 1
 
 
-def is_parameter_space(space: spaces.Space) -> bool:
+def is_parameter_space(space: spaces.Space[Any]) -> bool:
     """Whether a subtree can be the parameters of one action: boxes only, ``Discrete(1)`` standing for none."""
     return all(isinstance(leaf, spaces.Box) or is_empty_discrete(leaf) for _, leaf in leaves_of(space))
 
@@ -74,7 +74,7 @@ def replace_part(action: Any, path: Path, value: Any) -> Any:
     return container if isinstance(action, dict) else tuple(container)
 
 
-def digits_of(space: spaces.Space) -> tuple[tuple[int, ...], np.ndarray]:
+def digits_of(space: spaces.Space[Any]) -> tuple[tuple[int, ...], np.ndarray]:
     """:return: the number of values of every digit of a discrete leaf, and the smallest value of each."""
     if isinstance(space, spaces.Discrete):
         return (int(space.n),), np.array([int(space.start)])
@@ -85,7 +85,7 @@ def digits_of(space: spaces.Space) -> tuple[tuple[int, ...], np.ndarray]:
     return (2,) * size, np.zeros(size, dtype=np.int64)
 
 
-def find_options(space: spaces.Space) -> tuple[Path, list[tuple[Path, spaces.Space]]] | None:
+def find_options(space: spaces.Space[Any]) -> tuple[Path, list[tuple[Path, spaces.Space[Any]]]] | None:
     """
     Look for a ``Discrete(K)`` next to K parameter spaces, flat or gathered in one container.
 
@@ -95,7 +95,7 @@ def find_options(space: spaces.Space) -> tuple[Path, list[tuple[Path, spaces.Spa
     for key, child in children:
         if not isinstance(child, spaces.Discrete):
             continue
-        rest: list[tuple[Path, spaces.Space]] = [((other,), part) for other, part in children if other != key]
+        rest: list[tuple[Path, spaces.Space[Any]]] = [((other,), part) for other, part in children if other != key]
         candidates = [rest]
         if len(rest) == 1 and (inner := children_of(rest[0][1])) is not None:
             candidates.insert(0, [((*rest[0][0], name), part) for name, part in inner])
@@ -105,7 +105,7 @@ def find_options(space: spaces.Space) -> tuple[Path, list[tuple[Path, spaces.Spa
     return None
 
 
-def collect_discrete(space: spaces.Space) -> list[DiscreteLeaf]:
+def collect_discrete(space: spaces.Space[Any]) -> list[DiscreteLeaf]:
     """
     :param space: an action space whose boxes serve all actions
     :return: its discrete leaves
@@ -125,7 +125,7 @@ def collect_discrete(space: spaces.Space) -> list[DiscreteLeaf]:
     return leaves
 
 
-def collect_boxes(space: spaces.Space, prefix: Path, name: str | None = None) -> list[BoxLeaf]:
+def collect_boxes(space: spaces.Space[Any], prefix: Path, name: str | None = None) -> list[BoxLeaf]:
     """
     :param space: the parameters of one action, or of all
     :param prefix: path of ``space`` in the native action
@@ -152,11 +152,11 @@ def collect_boxes(space: spaces.Space, prefix: Path, name: str | None = None) ->
     return boxes
 
 
-def template_action(space: spaces.Space) -> Any:
+def template_action(space: spaces.Space[Any]) -> Any:
     """:return: a native action with every box at the middle of its bounds, to be filled in by ``to_native``"""
     cache: dict[Any, np.ndarray] = {}
 
-    def build(part: spaces.Space) -> Any:
+    def build(part: spaces.Space[Any]) -> Any:
         if isinstance(part, spaces.Tuple):
             return tuple(build(child) for child in part.spaces)
         if isinstance(part, spaces.Dict):

@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_chdp.common.checks import check_one_of
+from sb3_chdp.common.rows import RowLayout
 from sb3_chdp.common.space_tree import (
     DiscreteLeaf,
     Path,
@@ -24,23 +25,6 @@ from sb3_chdp.common.space_tree import (
 
 MAX_DISCRETE_ACTIONS = 65_536
 LAYOUTS = ("auto", "per_action", "shared")
-
-
-class HybridAction(tuple):
-    """
-    A native action that is a tuple and remembers its row.
-
-    ``np.asarray`` of it gives the row ``[k | scaled parameters]``, so that ``VecCheckNan`` can look at a list of them.
-    It pickles as a plain tuple: a subprocess of the user never needs this class.
-    """
-
-    row: np.ndarray
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.array(self.row, dtype=dtype)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return tuple, (tuple(self),)
 
 
 class HybridActionSpec:
@@ -66,7 +50,7 @@ class HybridActionSpec:
         kinds of leaves, or with more than 65,536 joint discrete actions
     """
 
-    def __init__(self, space: spaces.Space, layout: str = "auto"):
+    def __init__(self, space: spaces.Space[Any], layout: str = "auto"):
         check_one_of(LAYOUTS, action_layout=layout)
         self.space = space
         self.layout = layout
@@ -77,7 +61,7 @@ class HybridActionSpec:
                 if not is_parameter_space(option):
                     raise ValueError(f"action_space.spaces[{i}] of a OneOf must hold Box spaces only, got {option}")
             self._discrete_leaves: list[DiscreteLeaf] = []
-            options: list[tuple[Path, spaces.Space]] = [(("option",), option) for option in space.spaces]
+            options: list[tuple[Path, spaces.Space[Any]]] = [(("option",), option) for option in space.spaces]
             self.is_shared = False
         elif isinstance(space, (spaces.Tuple, spaces.Dict)):
             choice = None if layout == "shared" else find_options(space)
@@ -119,6 +103,7 @@ class HybridActionSpec:
         """Fill the (K, Pmax) tables: mask, centre and half range of every parameter, column in the concatenated vector."""
         sizes = [boxes[-1].columns.stop if boxes else 0 for boxes in self._boxes]
         self.max_parameters = max(sizes)
+        self.columns = RowLayout(discrete_actions=1, parameters=self.max_parameters)
         if self.max_parameters == 0:
             raise ValueError(f"{self.space} has no continuous part: use an algorithm for discrete actions, e.g. DQN or PPO")
         n_options = len(self._boxes)
@@ -142,7 +127,7 @@ class HybridActionSpec:
     @property
     def row_size(self) -> int:
         """Length of a row ``[k | scaled parameters]``: 1 + Pmax."""
-        return 1 + self.max_parameters
+        return self.columns.width
 
     @cached_property
     def parameter_sizes(self) -> np.ndarray:
@@ -162,26 +147,22 @@ class HybridActionSpec:
         :return: n native actions
         """
         rows = np.asarray(rows)
-        choices = rows[:, 0].astype(np.int64)
+        choices = self.columns.discrete_actions(rows)
         if ((choices < 0) | (choices >= self.n_discrete_actions)).any():
             raise ValueError(f"The first column of a row must be in 0..{self.n_discrete_actions - 1}, got {choices}")
-        scaled = np.clip(rows[:, 1 : self.row_size].astype(np.float64), -1.0, 1.0)
+        scaled = np.clip(self.columns.view(rows, "parameters").astype(np.float64), -1.0, 1.0)
         values = self._centre[choices] + self._half[choices] * scaled
-        return [self._assemble(int(k), v, row[: self.row_size]) for k, v, row in zip(choices, values, rows, strict=True)]
+        return [self._assemble(int(k), v) for k, v in zip(choices, values, strict=True)]
 
-    def _assemble(self, k: int, values: np.ndarray, row: np.ndarray) -> Any:
+    def _assemble(self, k: int, values: np.ndarray) -> Any:
         option = 0 if self.is_shared else k
         native = self._templates[option if isinstance(self.space, spaces.OneOf) else 0]
         for box in self._boxes[option]:
             native = replace_part(native, box.path, cast_to_box(values[box.columns], box.space))
         if isinstance(self.space, spaces.OneOf):
-            native = (np.int64(k), native["option"])
-        else:
-            for leaf, digits in zip(self._discrete_leaves, self._split_index(k), strict=True):
-                native = replace_part(native, leaf.path, self._native_digits(leaf, digits))
-        if isinstance(native, tuple):
-            native = HybridAction(native)
-            native.row = row
+            return np.int64(k), native["option"]
+        for leaf, digits in zip(self._discrete_leaves, self._split_index(k), strict=True):
+            native = replace_part(native, leaf.path, self._native_digits(leaf, digits))
         return native
 
     def _split_index(self, k: int) -> Iterator[np.ndarray]:
@@ -212,13 +193,12 @@ class HybridActionSpec:
         else:
             digits = [np.ravel(get_part(action, leaf.path)) - leaf.start for leaf in self._discrete_leaves]
             k = int(np.ravel_multi_index(tuple(np.concatenate(digits).astype(np.int64)), self._radices))
-        row = np.zeros(self.row_size)
-        row[0] = k
+        parameters = np.zeros(self.max_parameters)
         for box in self._boxes[0 if self.is_shared else k]:
             values = np.ravel(get_part(action, box.path)).astype(np.float64) - self._centre[k, box.columns]
             half = self._half[k, box.columns]
-            row[1:][box.columns] = np.divide(values, half, out=np.zeros_like(values), where=half > 0)
-        return row
+            parameters[box.columns] = np.divide(values, half, out=np.zeros_like(values), where=half > 0)
+        return self.columns.pack(discrete_actions=np.array([k]), parameters=parameters[None])[0]
 
     def sample_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """
@@ -228,7 +208,7 @@ class HybridActionSpec:
         """
         choices = rng.integers(self.n_discrete_actions, size=n)
         parameters = rng.uniform(-1.0, 1.0, size=(n, self.max_parameters)) * self.mask[choices]
-        return np.concatenate([choices[:, None], parameters], axis=1)
+        return self.columns.pack(discrete_actions=choices, parameters=parameters)
 
     def own_parameters(self, choices: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """
@@ -237,14 +217,4 @@ class HybridActionSpec:
         :return: (n, 1 + Pmax) rows of the chosen actions with their own parameters
         """
         own_parameters = np.take_along_axis(parameters, self.parameter_index[choices], axis=1) * self.mask[choices]
-        return np.concatenate([choices[:, None], own_parameters], axis=1)
-
-    def rows_from_scores(self, actions: np.ndarray) -> np.ndarray:
-        """
-        Decode actions that hold a score for every discrete action and the parameters of all of them (PADDPG).
-
-        :param actions: (n, K + P) scores, then the scaled parameters of all actions one after the other
-        :return: (n, 1 + Pmax) rows of the actions with the highest scores
-        """
-        scores, parameters = np.split(np.asarray(actions), [self.n_discrete_actions], axis=1)
-        return self.own_parameters(scores.argmax(axis=1), parameters)
+        return self.columns.pack(discrete_actions=choices, parameters=own_parameters)

@@ -1,4 +1,4 @@
-"""What the baselines share that are SB3's TD3 on scores and parameters, answering in native actions."""
+"""Twin delayed deterministic policy gradients for hybrid actions: what the TD3 baselines share."""
 
 from typing import Any
 
@@ -6,16 +6,17 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
-from stable_baselines3.td3 import TD3
 from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
+from torch.nn import functional as F
 
-from sb3_chdp.common.hybrid_box import HybridBox, ScoreBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.policies import HybridPolicy
-from sb3_chdp.common.utils import default_optimizer_kwargs
+from sb3_chdp.common.samples import HybridReplaySamples
+from sb3_chdp.common.utils import TargetUpdate, default_optimizer_kwargs
 
 
 class _InvertGradient(th.autograd.Function):
@@ -25,7 +26,7 @@ class _InvertGradient(th.autograd.Function):
         return actions.clamp(-1, 1)
 
     @staticmethod
-    def backward(ctx: Any, gradient: th.Tensor) -> th.Tensor:  # type: ignore[override]
+    def backward(ctx: Any, gradient: th.Tensor) -> th.Tensor:
         (actions,) = ctx.saved_tensors
         # The loss falls along -gradient: where that leads up, what counts is the way left to 1, else to -1
         room = th.where(gradient < 0, 1 - actions, 1 + actions) / 2
@@ -39,12 +40,13 @@ class InvertingGradients(nn.Module):
     """
 
     def forward(self, actions: th.Tensor) -> th.Tensor:
-        return _InvertGradient.apply(actions)
+        return _InvertGradient.apply(actions)  # type: ignore[no-untyped-call]
 
 
 class HybridTD3Policy(HybridPolicy, TD3Policy):
     """
-    SB3's TD3 policy on the rows of a hybrid action space.
+    SB3's TD3 policy with an actor whose output stands for hybrid actions. Subclasses say how: by ``_predict``, which
+    returns rows, and ``_noisy_rows``.
 
     Arguments not listed here are those of :class:`stable_baselines3.td3.policies.TD3Policy`.
 
@@ -66,7 +68,7 @@ class HybridTD3Policy(HybridPolicy, TD3Policy):
 
     @property
     def noise_dim(self) -> int:
-        return self.action_space.shape[0]
+        return get_action_dim(self.actor.action_space)
 
     def noisy_rows(self, observation: np.ndarray | dict[str, np.ndarray], noise: np.ndarray) -> np.ndarray:
         self.set_training_mode(False)
@@ -77,16 +79,16 @@ class HybridTD3Policy(HybridPolicy, TD3Policy):
             return self._noisy_rows(obs_tensor, noise_tensor).cpu().numpy()
 
     def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor) -> th.Tensor:
-        """:return: rows of the actor with (n, noise_dim) noise on its output"""
-        return (self.actor(obs) + noise).clamp(-1, 1)
+        """:return: (n, columns) rows for (n, noise_dim) noise on the actor's output"""
+        raise NotImplementedError
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "inverting_gradients": self.inverting_gradients}
 
 
-class HybridTD3(HybridOffPolicyAlgorithm, TD3):
+class HybridTD3(HybridOffPolicyAlgorithm):
     """
-    Base class: SB3's TD3 on hybrid actions, by default on the space of K scores and P parameters.
+    Base class of the TD3 baselines. A gradient step is that of SB3's TD3, in parts that subclasses replace.
 
     Parameters not listed here are those of :class:`stable_baselines3.TD3`.
 
@@ -104,7 +106,12 @@ class HybridTD3(HybridOffPolicyAlgorithm, TD3):
     :param inverting_gradients: whether the gradients at the actor's output are inverted
     """
 
-    policy: HybridTD3Policy  # type: ignore[assignment]
+    policy: HybridTD3Policy
+    actor: Actor
+    actor_target: Actor
+    # Twin networks, whose inputs are up to the subclasses
+    critic: Any
+    critic_target: Any
 
     def __init__(
         self,
@@ -178,9 +185,6 @@ class HybridTD3(HybridOffPolicyAlgorithm, TD3):
         if _init_setup_model:
             self._setup_model()
 
-    def _make_hybrid_space(self) -> HybridBox:
-        return ScoreBox(self.action_space, self.action_layout)
-
     def _network_kwargs(self) -> dict[str, Any]:
         return {"inverting_gradients": self.inverting_gradients}
 
@@ -188,3 +192,77 @@ class HybridTD3(HybridOffPolicyAlgorithm, TD3):
         initial = self.exploration_noise if self.exploration_initial_noise is None else self.exploration_initial_noise
         self.exploration_noise_schedule = self._exploration_schedule(initial, self.exploration_noise)
         super()._setup_model()
+        self._create_aliases()
+        self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
+
+    def _create_aliases(self) -> None:
+        self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
+        self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
+
+    def train(self, gradient_steps: int, batch_size: int = 128) -> None:
+        # Switch to train mode (this affects batch norm / dropout)
+        self.policy.set_training_mode(True)
+        self._update_learning_rates()
+
+        critic_losses, actor_losses = [], []
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            replay_data = self._sample_batch(batch_size)
+
+            critic_loss = self._critic_loss(replay_data)
+            critic_losses.append(critic_loss.detach())
+            self.critic.optimizer.zero_grad()
+            critic_loss.backward()
+            self.critic.optimizer.step()
+
+            # Delayed policy updates
+            if self._n_updates % self.policy_delay == 0:
+                actor_loss = self._actor_loss(replay_data)
+                actor_losses.append(actor_loss.detach())
+                self.actor.optimizer.zero_grad()
+                actor_loss.backward()
+                self.actor.optimizer.step()
+
+                self.update_targets(self.tau)
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/critic_loss", th.stack(critic_losses).mean().item())
+        if actor_losses:
+            self.logger.record("train/actor_loss", th.stack(actor_losses).mean().item())
+
+    def _update_learning_rates(self) -> None:
+        """Set the learning rates of all optimizers according to their schedules."""
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
+
+    def _smoothed_target_actions(self, next_obs: PyTorchObs) -> th.Tensor:
+        """:return: (B, actor's outputs) what the target actor puts out, with clipped noise"""
+        next_actions = self.actor_target(next_obs)
+        noise = th.empty_like(next_actions).normal_(0, self.target_policy_noise)
+        return (next_actions + noise.clamp(-self.target_noise_clip, self.target_noise_clip)).clamp(-1, 1)
+
+    def _next_q_values(self, next_obs: PyTorchObs) -> th.Tensor:
+        """:return: (B, 1) min_i Q_i(s', pi(s') + noise) of the targets"""
+        q_values = self.critic_target(next_obs, self._smoothed_target_actions(next_obs))
+        return th.cat(q_values, dim=1).min(dim=1, keepdim=True).values
+
+    def _current_q_values(self, replay_data: HybridReplaySamples) -> tuple[th.Tensor, ...]:
+        """:return: (B, 1) Q_i(s, a) of every critic"""
+        return self.critic(replay_data.observations, replay_data.actions)
+
+    def _critic_loss(self, replay_data: HybridReplaySamples) -> th.Tensor:
+        """:return: mean squared Bellman errors, summed over the critics"""
+        with th.no_grad():
+            next_q_values = self._next_q_values(replay_data.next_observations)
+            target_q_values = replay_data.rewards + (1 - replay_data.dones) * replay_data.discounts * next_q_values
+        return th.stack([F.mse_loss(q, target_q_values) for q in self._current_q_values(replay_data)]).sum()
+
+    def _actor_loss(self, replay_data: HybridReplaySamples) -> th.Tensor:
+        """:return: the negative mean of Q1(s, pi(s))"""
+        return -self.critic.q1_forward(replay_data.observations, self.actor(replay_data.observations)).mean()
+
+    def _excluded_save_params(self) -> list[str]:
+        parts_of_policy = ["actor", "critic", "actor_target", "critic_target", "update_targets"]
+        return [*super()._excluded_save_params(), *parts_of_policy]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "actor.optimizer", "critic.optimizer"], []

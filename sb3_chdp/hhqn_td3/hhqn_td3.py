@@ -4,6 +4,7 @@ from typing import ClassVar
 
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_chdp.common.hybrid_box import HybridBox, ScoreBox
 from sb3_chdp.common.td3 import HybridTD3
 from sb3_chdp.hhqn_td3.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 
@@ -36,3 +37,6 @@ class HHQNTD3(HybridTD3):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
+
+    def _make_hybrid_space(self) -> HybridBox:
+        return ScoreBox(self.action_space, self.action_layout)

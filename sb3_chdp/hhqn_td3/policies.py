@@ -43,14 +43,14 @@ class HierarchicalActor(Actor):
         :param noise: (B, K + P) action noise; the lower actor sees the noisy scores, which decide what is executed
         :return: (B, K + P) scores and parameters
         """
-        features = self.extract_features(obs, self.features_extractor)
+        features, columns = self.extract_features(obs, self.features_extractor), self.action_space.columns
         scores = self.mu(features)
         if noise is not None:
-            scores = (scores + noise[:, : scores.shape[1]]).clamp(-1, 1)
+            scores = (scores + columns.view(noise, "scores")).clamp(-1, 1)
         parameters = self.lower(th.cat([features, scores], dim=1))
         if noise is not None:
-            parameters = (parameters + noise[:, scores.shape[1] :]).clamp(-1, 1)
-        return th.cat([scores, parameters], dim=1)
+            parameters = (parameters + columns.view(noise, "parameters")).clamp(-1, 1)
+        return columns.pack(scores=scores, parameters=parameters)
 
 
 class HHQNTD3Policy(HybridTD3Policy):

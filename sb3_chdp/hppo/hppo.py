@@ -5,19 +5,20 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from sb3_contrib.common.maskable.utils import is_masking_supported
+from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.checks import check_finite
 from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox
-from sb3_chdp.common.on_policy_algorithm import HybridDictRolloutBuffer, HybridRolloutBuffer, NativeActionVecEnv
+from sb3_chdp.common.rollout_buffers import HybridDictRolloutBuffer, HybridRolloutBuffer
 from sb3_chdp.hppo.policies import CnnPolicy, HPPOPolicy, MlpPolicy, MultiInputPolicy
 
 SelfHPPO = TypeVar("SelfHPPO", bound="HPPO")
@@ -117,7 +118,7 @@ class HPPO(HybridAlgorithm, PPO):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        # Not PPO's, which refuses hybrid action spaces
+        # Not PPO's constructor, which accepts no hybrid action spaces and hands on no other list of spaces
         OnPolicyAlgorithm.__init__(
             self,
             policy,
@@ -159,9 +160,7 @@ class HPPO(HybridAlgorithm, PPO):
             self._setup_model()
 
     def _make_hybrid_space(self) -> HybridBox:
-        box = ConcatenatedBox(self.action_space, self.action_layout)
-        # The masks are stored behind the parameters
-        return ConcatenatedBox(self.action_space, self.action_layout, box.spec.n_discrete_actions) if self.use_masking else box
+        return ConcatenatedBox(self.action_space, self.action_layout, with_masks=self.use_masking)
 
     def _setup_model(self) -> None:
         if self.rollout_buffer_class is None:
@@ -169,20 +168,59 @@ class HPPO(HybridAlgorithm, PPO):
             self.rollout_buffer_class = HybridDictRolloutBuffer if is_dict else HybridRolloutBuffer
         super()._setup_model()
 
+    def _action_masks(self, env: VecEnv) -> np.ndarray | None:
+        """:return: (n_envs, K) masks for the next actions, None without masking"""
+        if not self.use_masking:
+            return None
+        masks = get_action_masks(env)
+        expected = (env.num_envs, self.hybrid_space.spec.n_discrete_actions)
+        if masks.shape != expected:
+            raise ValueError(f"action_masks() must give (n_envs, K) = {expected} booleans, got shape {masks.shape}")
+        return masks
+
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
+        """SB3's ``collect_rollouts``, with masks for the policy and rows that the environment gets as native actions."""
         if self.use_masking and not is_masking_supported(env):
             raise ValueError("use_masking is True but the environment has no method action_masks()")
-        check_finite("The observation", self._last_obs)  # type: ignore[arg-type]
-        set_action_masks = self.policy.set_action_masks if self.use_masking else None
-        native_env = NativeActionVecEnv(env, self.hybrid_space, set_action_masks)
-        try:
-            return super().collect_rollouts(native_env, callback, rollout_buffer, n_rollout_steps)
-        finally:
-            self.policy.set_action_masks(None)
+        assert self._last_obs is not None and self._last_episode_starts is not None, "No previous observation was provided"
+        check_finite("The observation", self._last_obs)
+        native_env = self.native_env(env)
+        self.policy.set_training_mode(False)
+        rollout_buffer.reset()
+        callback.on_rollout_start()
 
-    def predict(  # type: ignore[override]
+        for _ in range(n_rollout_steps):
+            with th.no_grad():
+                obs_tensor = obs_as_tensor(self._last_obs, self.device)
+                row_tensor, values, log_probs = self.policy(obs_tensor, action_masks=self._action_masks(env))
+            actions = row_tensor.cpu().numpy()
+            new_obs, rewards, dones, infos = native_env.step(actions)
+            self.num_timesteps += env.num_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+
+            self._update_info_buffer(infos, dones)
+            for i in np.flatnonzero(dones):
+                # Time limits bootstrap
+                if infos[i].get("TimeLimit.truncated", False):
+                    terminal_obs = self.policy.obs_to_tensor(infos[i]["terminal_observation"])[0]
+                    with th.no_grad():
+                        rewards[i] += self.gamma * self.policy.predict_values(terminal_obs).item()
+            rollout_buffer.add(self._last_obs, actions, rewards, self._last_episode_starts, values, log_probs)
+            self._last_obs = new_obs
+            self._last_episode_starts = dones
+
+        with th.no_grad():
+            values = self.policy.predict_values(obs_as_tensor(self._last_obs, self.device))
+        rollout_buffer.compute_returns_and_advantage(last_values=values, dones=dones)
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def predict(
         self,
         observation: np.ndarray | dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,

@@ -4,9 +4,8 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_chdp.common.distributions import HybridDistribution
 from sb3_chdp.common.hybrid_box import ConcatenatedBox
@@ -21,11 +20,10 @@ class HPPOPolicy(HybridPolicy, ActorCriticPolicy):
     ``log_std_init`` is -0.5 by default.
     """
 
-    action_space: ConcatenatedBox  # type: ignore[assignment]
-    action_dist: HybridDistribution  # type: ignore[assignment]
+    action_space: ConcatenatedBox
+    action_dist: HybridDistribution
 
     def __init__(self, *args: Any, **kwargs: Any):
-        self.action_masks: np.ndarray | None = None
         super().__init__(*args, **{"log_std_init": -0.5, **kwargs})
 
     def _build(self, lr_schedule: Schedule) -> None:
@@ -33,20 +31,42 @@ class HPPOPolicy(HybridPolicy, ActorCriticPolicy):
         self.action_dist = HybridDistribution(self.action_space)
         super()._build(lr_schedule)
 
-    def set_action_masks(self, action_masks: np.ndarray | None) -> None:
+    def forward(
+        self, obs: PyTorchObs, deterministic: bool = False, action_masks: np.ndarray | None = None
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """
-        :param action_masks: (n_envs, K) masks for the next actions, False for discrete actions that may not be taken;
-            None for none
+        :param obs: observations
+        :param deterministic: whether to take the most probable discrete actions and their mean parameters
+        :param action_masks: (n, K) False for discrete actions that may not be taken
+        :return: (n, columns) rows, (n, 1) values, (n, 2) log-probabilities of both parts of the actions
         """
-        self.action_masks = action_masks
+        features = self.extract_features(obs)
+        pi_features, vf_features = (features, features) if isinstance(features, th.Tensor) else features
+        values = self.value_net(self.mlp_extractor.forward_critic(vf_features))
+        distribution = self._get_action_dist_from_latent(self.mlp_extractor.forward_actor(pi_features))
+        assert isinstance(distribution, HybridDistribution)
+        distribution.apply_masking(action_masks)
+        rows = distribution.get_actions(deterministic=deterministic)
+        return rows, values, distribution.log_prob(rows)
 
-    def _get_action_dist_from_latent(self, latent_pi: th.Tensor) -> Distribution:
-        distribution = super()._get_action_dist_from_latent(latent_pi)
-        if self.action_masks is not None:
-            self.action_dist.apply_masking(self.action_masks)
+    def get_distribution(self, obs: PyTorchObs, action_masks: np.ndarray | None = None) -> HybridDistribution:
+        """
+        :param obs: observations
+        :param action_masks: (n, K) False for discrete actions that may not be taken
+        :return: the distribution of their actions
+        """
+        distribution = super().get_distribution(obs)
+        assert isinstance(distribution, HybridDistribution)
+        distribution.apply_masking(action_masks)
         return distribution
 
-    def predict(  # type: ignore[override]
+    def _predict(
+        self, observation: PyTorchObs, deterministic: bool = False, action_masks: np.ndarray | None = None
+    ) -> th.Tensor:
+        """:return: (n, columns) rows"""
+        return self.get_distribution(observation, action_masks).get_actions(deterministic=deterministic)
+
+    def predict(
         self,
         observation: np.ndarray | dict[str, np.ndarray],
         state: tuple[np.ndarray, ...] | None = None,
@@ -59,12 +79,7 @@ class HPPOPolicy(HybridPolicy, ActorCriticPolicy):
 
         :param action_masks: (K,) or (n, K) False for discrete actions that may not be taken
         """
-        # A callback may predict while a rollout is being collected
-        rollout_masks, self.action_masks = self.action_masks, action_masks
-        try:
-            return super().predict(observation, state, episode_start, deterministic)
-        finally:
-            self.action_masks = rollout_masks
+        return self._predict_native(observation, deterministic, action_masks=action_masks), state
 
 
 MlpPolicy = HPPOPolicy

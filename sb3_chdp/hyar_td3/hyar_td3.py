@@ -1,44 +1,22 @@
 """TD3 in the latent space of HyAR's action representation."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 
 from sb3_chdp.common.checks import check_at_least
 from sb3_chdp.common.hybrid_box import HybridBox
+from sb3_chdp.common.samples import HybridReplaySamples
 from sb3_chdp.common.td3 import HybridTD3
-from sb3_chdp.common.type_aliases import name_columns
 from sb3_chdp.hyar_td3.policies import CnnPolicy, HyARTD3Policy, MlpPolicy, MultiInputPolicy
 from sb3_chdp.hyar_td3.representation import ActionBatch
 
 # Size of the sample that the latent bounds are fitted to
 BOUNDS_SAMPLE = 5000
-
-
-class LatentReplay:
-    """
-    The replay buffer as TD3 sees it: its actions are latents under the present representation.
-
-    :param model: the algorithm whose buffer it is
-    """
-
-    def __init__(self, model: "HyARTD3"):
-        assert model.replay_buffer is not None
-        self.model, self.replay_buffer = model, model.replay_buffer
-        self.kept: list[th.Tensor] = []
-
-    def sample(self, batch_size: int, env: Any = None) -> ReplayBufferSamples:
-        replay_data = self.replay_buffer.sample(batch_size, env=env)
-        batch, latents = self.model._action_batch(replay_data)
-        latents, kept = self.model.policy.representation.relabel(batch, latents)
-        self.kept.append(kept.float().mean(dim=0))
-        return replay_data._replace(actions=latents)
 
 
 class HyARTD3(HybridTD3):
@@ -148,33 +126,24 @@ class HyARTD3(HybridTD3):
             warm_up = self._next_representation_update == 0
             self._train_representation(self.representation_warmup_steps if warm_up else self.representation_steps)
             self._next_representation_update = self._n_updates + self.representation_freq
-        with self._latent_replay() as replay:
-            super().train(gradient_steps, batch_size)
-        kept_embeddings, kept_z = th.stack(replay.kept).mean(dim=0).tolist()
-        self.logger.record("train/kept_embeddings", kept_embeddings)
-        self.logger.record("train/kept_parameter_latents", kept_z)
+        super().train(gradient_steps, batch_size)
 
-    @contextmanager
-    def _latent_replay(self) -> Iterator[LatentReplay]:
-        """Let TD3's ``train()`` sample latents in place of the stored rows."""
-        stored = self.replay_buffer
-        replay = LatentReplay(self)
-        self.replay_buffer = replay  # type: ignore[assignment]
-        try:
-            yield replay
-        finally:
-            self.replay_buffer = stored
+    def _critic_loss(self, replay_data: HybridReplaySamples) -> th.Tensor:
+        # To the critics, an action is the latents that stand for it under the present representation
+        latents, kept = self.policy.representation.relabel(self._action_batch(replay_data), replay_data.latents)
+        kept_embeddings, kept_z = kept.float().mean(dim=0).tolist()
+        self.logger.record_mean("train/kept_embeddings", kept_embeddings)
+        self.logger.record_mean("train/kept_parameter_latents", kept_z)
+        return super()._critic_loss(replay_data._replace(actions=latents))
 
-    def _action_batch(self, replay_data: ReplayBufferSamples) -> tuple[ActionBatch, th.Tensor]:
-        """:return: what the representation needs to know of a batch, and its (B, d1 + d2) stored latents"""
-        data = name_columns(replay_data, self.hybrid_space, self.gamma)
-        features = self.policy.state_features(data.observations)
-        changes = self.policy.state_features(data.next_observations) - features
-        return ActionBatch(features, data.discrete_actions, data.parameters, changes), data.latents
+    def _action_batch(self, replay_data: HybridReplaySamples) -> ActionBatch:
+        """:return: what the representation needs to know of a batch"""
+        features = self.policy.state_features(replay_data.observations)
+        changes = self.policy.state_features(replay_data.next_observations) - features
+        return ActionBatch(features, replay_data.discrete_actions, replay_data.parameters, changes)
 
     def _sample_actions(self, batch_size: int) -> ActionBatch:
-        assert self.replay_buffer is not None
-        return self._action_batch(self.replay_buffer.sample(batch_size, env=self._vec_normalize_env))[0]
+        return self._action_batch(self._sample_batch(batch_size))
 
     def _train_representation(self, gradient_steps: int) -> None:
         """

@@ -64,15 +64,12 @@ class HyARTD3Policy(HybridTD3Policy):
         k = self.representation.nearest_action(embeddings)
         z = self.representation.unscale(scaled_z)
         parameters, _ = self.representation.decode(self.state_features(obs), k, z)
-        return th.cat([k[:, None].float(), parameters, embeddings, z], dim=1)
+        stored_latents = th.cat([embeddings, z], dim=1)
+        return self.action_space.columns.pack(discrete_actions=k, parameters=parameters, latents=stored_latents)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """:return: (B, columns) rows"""
         return self.decode(observation, self.actor(observation))
-
-    @property
-    def noise_dim(self) -> int:
-        return self.action_space.latent_dim
 
     def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor) -> th.Tensor:
         return self.decode(obs, (self.actor(obs) + noise).clamp(-1, 1))
@@ -80,7 +77,7 @@ class HyARTD3Policy(HybridTD3Policy):
     def random_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Uniformly random actions; their latents are unknown (NaN) until they are looked at by the representation."""
         rows = super().random_rows(rng, n)
-        rows[:, self.action_space.spec.row_size :] = np.nan
+        self.action_space.columns.view(rows, "latents")[:] = np.nan
         return rows
 
     def _get_constructor_parameters(self) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from typing import ClassVar
 
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_chdp.common.hybrid_box import HybridBox, ScoreBox
 from sb3_chdp.common.td3 import HybridTD3
 from sb3_chdp.pa_td3.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 
@@ -13,8 +14,8 @@ class PATD3(HybridTD3):
     Parameterized Action TD3 (PA-TD3), PADDPG with TD3 in place of DDPG
 
     One actor gives a score to every discrete action and parameters to all of them; the action of highest score is taken
-    with its own parameters. The critics see all scores and parameters. It is SB3's TD3 on the same environment behind
-    :class:`FlattenHybridAction`, with native actions.
+    with its own parameters. The critics see all scores and parameters. It learns as SB3's TD3 does on the same environment
+    behind :class:`FlattenHybridAction`, and deals in native actions.
 
     Papers: Hausknecht and Stone (2016), https://arxiv.org/abs/1511.04143; Fujimoto et al. (2018),
     https://arxiv.org/abs/1802.09477. Reference scripts: HyAR repository.
@@ -35,3 +36,6 @@ class PATD3(HybridTD3):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
+
+    def _make_hybrid_space(self) -> HybridBox:
+        return ScoreBox(self.action_space, self.action_layout)

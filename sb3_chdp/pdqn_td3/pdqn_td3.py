@@ -4,18 +4,16 @@ from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
-from torch.nn import functional as F
 
 from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox
+from sb3_chdp.common.samples import HybridReplaySamples
 from sb3_chdp.common.td3 import HybridTD3
-from sb3_chdp.common.utils import TargetUpdate
 from sb3_chdp.pdqn_td3.policies import (
     CnnPolicy,
     MlpPolicy,
     MultiInputPolicy,
-    ParameterActor,
     ParameterizedQNetwork,
     PDQNTD3Policy,
 )
@@ -53,7 +51,7 @@ class PDQNTD3(HybridTD3):
         False: tanh and plain gradients
     :param multi_pass: whether Q of an action sees the parameters of that action only (MP-DQN)
     :param passthrough: ``dict(weight=..., bias=...)`` of a fixed linear function of the observation that is added to the
-        actor's outputs, see :class:`ParameterActor`
+        actor's outputs, see :class:`sb3_chdp.pdqn_td3.policies.ParameterActor`
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -61,11 +59,9 @@ class PDQNTD3(HybridTD3):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
-    policy: PDQNTD3Policy  # type: ignore[assignment]
-    actor: ParameterActor
-    actor_target: ParameterActor
-    critic: ParameterizedQNetwork  # type: ignore[assignment]
-    critic_target: ParameterizedQNetwork  # type: ignore[assignment]
+    policy: PDQNTD3Policy
+    critic: ParameterizedQNetwork
+    critic_target: ParameterizedQNetwork
 
     def __init__(
         self,
@@ -106,69 +102,26 @@ class PDQNTD3(HybridTD3):
     def _setup_model(self) -> None:
         super()._setup_model()
         self.actor_lr_schedule = FloatSchedule(self.actor_learning_rate)
-        self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
 
-    def train(self, gradient_steps: int, batch_size: int = 128) -> None:
-        # Switch to train mode (this affects batch norm / dropout)
-        self.policy.set_training_mode(True)
-        # Update learning rates according to their schedules
+    def _update_learning_rates(self) -> None:
         self._update_learning_rate(self.critic.optimizer)
         actor_learning_rate = self.actor_lr_schedule(self._current_progress_remaining)
         update_learning_rate(self.actor.optimizer, actor_learning_rate)
-
-        critic_losses, actor_losses = [], []
-        for _ in range(gradient_steps):
-            self._n_updates += 1
-            assert self.replay_buffer is not None
-            replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-
-            critic_loss = self._critic_loss(replay_data)
-            critic_losses.append(critic_loss.detach())
-            self.critic.optimizer.zero_grad()
-            critic_loss.backward()
-            self.critic.optimizer.step()
-
-            # Delayed policy updates
-            if self._n_updates % self.policy_delay == 0:
-                actor_loss = self._actor_loss(replay_data)
-                actor_losses.append(actor_loss.detach())
-                self.actor.optimizer.zero_grad()
-                actor_loss.backward()
-                self.actor.optimizer.step()
-
-                self.update_targets(self.tau)
-
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/actor_learning_rate", actor_learning_rate)
-        self.logger.record("train/critic_loss", th.stack(critic_losses).mean().item())
-        if actor_losses:
-            self.logger.record("train/actor_loss", th.stack(actor_losses).mean().item())
 
-    def _critic_loss(self, replay_data: ReplayBufferSamples) -> th.Tensor:
-        """Squared Bellman errors of both Q-networks, with the target max_k min_i Q_i(s', x(s') + noise)_k."""
-        discounts = self.gamma if replay_data.discounts is None else replay_data.discounts
-        with th.no_grad():
-            # Parameters according to the target actor, with clipped noise
-            next_parameters = self.actor_target(replay_data.next_observations)
-            noise = th.randn_like(next_parameters) * self.target_policy_noise
-            noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
-            next_parameters = (next_parameters + noise).clamp(-1, 1)
-            next_features = self.critic_target.features(replay_data.next_observations)
-            next_q_values = th.min(*self.critic_target(next_features, next_parameters)).max(dim=1, keepdim=True)[0]
-            target_q_values = replay_data.rewards + (1 - replay_data.dones) * discounts * next_q_values
-        k, parameters = replay_data.actions[:, 0].long(), replay_data.actions[:, 1:]
-        q1, q2 = self.critic.of_actions(self.critic.features(replay_data.observations), parameters, k)
-        return F.mse_loss(q1, target_q_values) + F.mse_loss(q2, target_q_values)
+    def _next_q_values(self, next_obs: PyTorchObs) -> th.Tensor:
+        """:return: (B, 1) max_k min_i Q_i(s', x(s') + noise)_k of the targets"""
+        next_parameters = self._smoothed_target_actions(next_obs)
+        q1, q2 = self.critic_target(self.critic_target.features(next_obs), next_parameters)
+        return th.min(q1, q2).max(dim=1, keepdim=True).values
 
-    def _actor_loss(self, replay_data: ReplayBufferSamples) -> th.Tensor:
-        """The negative sum of Q1 over all discrete actions, with the actor's parameters."""
+    def _current_q_values(self, replay_data: HybridReplaySamples) -> tuple[th.Tensor, ...]:
+        features = self.critic.features(replay_data.observations)
+        return self.critic.of_actions(features, replay_data.parameters, replay_data.discrete_actions)
+
+    def _actor_loss(self, replay_data: HybridReplaySamples) -> th.Tensor:
+        """:return: the negative sum of Q1 over all discrete actions, with the actor's parameters"""
         with th.no_grad():
             features = self.critic.features(replay_data.observations)
         q1, _ = self.critic(features, self.actor(replay_data.observations))
         return -q1.sum(dim=1).mean()
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "update_targets"]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "actor.optimizer", "critic.optimizer"], []

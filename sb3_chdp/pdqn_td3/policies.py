@@ -5,6 +5,7 @@ from typing import Any
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.td3.policies import Actor
@@ -38,7 +39,7 @@ class ParameterActor(Actor):
         **kwargs: Any,
     ):
         super().__init__(*args, **kwargs)
-        n_parameters = self.action_space.shape[0]  # type: ignore[index]
+        n_parameters = get_action_dim(self.action_space)
         self.inverting_gradients = inverting_gradients
         self.mu = nn.Sequential(*create_mlp(self.features_dim, n_parameters, self.net_arch, self.activation_fn))
         self.squash = InvertingGradients() if inverting_gradients else nn.Tanh()
@@ -79,7 +80,7 @@ class ParameterizedQNetwork(BaseModel):
 
     def __init__(
         self,
-        observation_space: spaces.Space,
+        observation_space: spaces.Space[Any],
         action_space: ConcatenatedBox,
         net_arch: list[int],
         features_extractor: BaseFeaturesExtractor,
@@ -161,7 +162,7 @@ class PDQNTD3Policy(HybridTD3Policy):
     :param multi_pass: see :class:`ParameterizedQNetwork`
     """
 
-    action_space: ConcatenatedBox  # type: ignore[assignment]
+    action_space: ConcatenatedBox
     actor: ParameterActor
     actor_target: ParameterActor
     critic: ParameterizedQNetwork  # type: ignore[assignment]
@@ -200,16 +201,14 @@ class PDQNTD3Policy(HybridTD3Policy):
         """:return: (B, 1 + P) rows"""
         parameters = self.actor(observation)
         q1, _ = self.critic(self.critic.features(observation), parameters)
-        return th.cat([q1.argmax(dim=1, keepdim=True), parameters], dim=1)
+        return self.action_space.columns.pack(discrete_actions=q1.argmax(dim=1), parameters=parameters)
 
     def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor) -> th.Tensor:
         rows = self._predict(obs)
         # k is the best action for the parameters without noise
-        return th.cat([rows[:, :1], (rows[:, 1:] + noise).clamp(-1, 1)], dim=1)
-
-    @property
-    def noise_dim(self) -> int:
-        return self.action_space.spec.n_parameters
+        parameters = self.action_space.columns.view(rows, "parameters")
+        parameters.add_(noise).clamp_(-1, 1)
+        return rows
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         own = dict(passthrough=self.passthrough, multi_pass=self.multi_pass)

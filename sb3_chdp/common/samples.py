@@ -1,4 +1,4 @@
-"""Typed views of what the replay buffer returns."""
+"""What the replay buffer returns, with the columns of its rows named."""
 
 from typing import NamedTuple
 
@@ -13,11 +13,13 @@ class HybridReplaySamples(NamedTuple):
     """
     A batch with the columns of its action rows named.
 
-    Shapes: discrete_actions (B,) int64, parameters (B, Pmax) in [-1, 1] with padding 0, latents (B, latent_dim),
-    rewards, dones, discounts and weights (B, 1).
+    Shapes: actions (B, columns), the rows; of these discrete_actions (B,) int64, parameters (B, Pmax) in [-1, 1] with
+    padding 0, or (B, P) those of all actions, latents (B, latent_dim), which may be 0 columns; rewards, dones, discounts
+    and weights (B, 1).
     """
 
     observations: PyTorchObs
+    actions: th.Tensor
     discrete_actions: th.Tensor
     parameters: th.Tensor
     latents: th.Tensor
@@ -36,12 +38,13 @@ def name_columns(
     :param action_space: the space of the stored rows
     :param gamma: discount factor, used if the buffer gives none (n-step buffers do)
     """
-    row_size = action_space.spec.row_size
+    columns, rows = action_space.columns, replay_data.actions
     return HybridReplaySamples(
         observations=replay_data.observations,
-        discrete_actions=replay_data.actions[:, 0].long(),
-        parameters=replay_data.actions[:, 1:row_size],
-        latents=replay_data.actions[:, row_size:],
+        actions=rows,
+        discrete_actions=columns.discrete_actions(rows),
+        parameters=columns.view(rows, "parameters"),
+        latents=columns.view(rows, "latents") if "latents" in columns else rows[:, :0],
         next_observations=replay_data.next_observations,
         dones=replay_data.dones,
         rewards=replay_data.rewards,

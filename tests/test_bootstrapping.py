@@ -1,0 +1,35 @@
+"""Learning over several steps, where values of next states decide."""
+
+import pytest
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3, PDQNTD3
+from tests.hybrid_envs import HybridChainEnv
+
+TD3 = dict(gradient_steps=8, learning_rate=1e-3, learning_starts=400, policy_kwargs=dict(net_arch=[64, 64]))
+SETTINGS = {
+    CHDP: dict(n_diffusion_steps=5, gradient_steps=4, learning_starts=400, policy_kwargs=dict(net_arch=[64, 64])),
+    PATD3: TD3,
+    HHQNTD3: TD3,
+    PDQNTD3: TD3,
+    HPPO: dict(n_steps=64, batch_size=64, learning_rate=1e-3),
+}
+
+
+def final_reward(algorithm, gamma):
+    env = make_vec_env(HybridChainEnv, 8, seed=0)
+    model = algorithm("MlpPolicy", env, seed=0, gamma=gamma, **SETTINGS[algorithm]).learn(2000)
+    # Environment and policy are deterministic
+    return evaluate_policy(model, make_vec_env(HybridChainEnv, 1), 1)[0]
+
+
+@pytest.mark.parametrize("algorithm", SETTINGS, ids=lambda algorithm: algorithm.__name__)
+def test_all_decisions_are_learnt(algorithm):
+    assert final_reward(algorithm, gamma=0.9) > 0.8
+
+
+@pytest.mark.parametrize("algorithm", SETTINGS, ids=lambda algorithm: algorithm.__name__)
+def test_without_next_values_the_last_decision_is_all_that_is_learnt(algorithm):
+    """The chain is no test of bootstrapping if the first decisions can be learnt without it."""
+    assert final_reward(algorithm, gamma=0.0) < 0.7
