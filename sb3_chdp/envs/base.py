@@ -40,7 +40,7 @@ class HybridEnv(gym.Env[np.ndarray, Any]):
             raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
         self.noise = noise
         self.render_mode = render_mode
-        #: called without arguments after resets and after every frame inside a step
+        #: called without arguments after resets, after every frame inside a step, and after an end without a frame
         self.frame_callback: Callable[[], Any] | None = self.render if render_mode == "human" else None
         self._canvas: Canvas | None = None
         self._pictures: list[np.ndarray] | None = None

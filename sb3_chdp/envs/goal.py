@@ -147,6 +147,8 @@ class GoalEnv(HybridEnv):
         frames = 0
         if self.time >= STEP_LIMIT:
             outcome = "timeout"
+            if self._is_watched:
+                self._frame_done(outcome)
         else:
             value, (low, high) = parameters[0], PARAMETER_BOUNDS[k][0]
             value = min(max(value, low), high)
