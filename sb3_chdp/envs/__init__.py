@@ -15,22 +15,19 @@ ENV_IDS = (
     "HardMove8-v0",
     "HardMove10-v0",
 )
-NAMESPACE = "sb3_chdp"
 # The count of the step limit belongs to the state of an episode
 _STATE_OF_LIMIT = WrapperSpec("StatefulTimeLimit", "sb3_chdp.envs.time_limit:StatefulTimeLimit", {})
 
 
-def _register(env_id: str, entry_point: str, **kwargs: Any) -> None:
-    """Register under the id of this package, and under the bare id if no other package has taken it."""
-    entry_point = f"{NAMESPACE}.envs.{entry_point}"
-    full_id = f"{NAMESPACE}/{env_id}"
-    gym.register(full_id, entry_point, additional_wrappers=(_STATE_OF_LIMIT,), **kwargs)
-    other = gym.registry.get(env_id)
-    if other is None or other.entry_point == entry_point:
-        gym.registry.pop(env_id, None)
-        gym.register(env_id, entry_point, additional_wrappers=(_STATE_OF_LIMIT,), **kwargs)
-    else:
-        gym.logger.warn(f"{env_id} is registered already, by {other.entry_point}: this package's is {full_id}")
+def _register(name: str, entry_point: str, **kwargs: Any) -> None:
+    """Register under the full id of this package, and under the bare one unless another package has taken it."""
+    entry_point = f"sb3_chdp.envs.{entry_point}"
+    for env_id in (f"sb3_chdp/{name}", name):
+        present = gym.registry.get(env_id)
+        if present is None:
+            gym.register(env_id, entry_point, additional_wrappers=(_STATE_OF_LIMIT,), **kwargs)
+        elif present.entry_point != entry_point:
+            gym.logger.warn(f"{env_id} is {present.entry_point}, registered before: this package's is sb3_chdp/{name}")
 
 
 _register("Platform-v0", "platform:PlatformEnv", max_episode_steps=200)
@@ -40,8 +37,6 @@ _register("HardGoal-v0", "hard_goal:HardGoalEnv")
 _register("CatchPoint-v0", "catch_point:CatchPointEnv", max_episode_steps=25)
 _register("HardMove-v0", "hard_move:HardMoveEnv", max_episode_steps=30)
 for n_actuators in (4, 6, 8, 10):
-    _register(
-        f"HardMove{n_actuators}-v0", "hard_move:HardMoveEnv", max_episode_steps=30, kwargs={"n_actuators": n_actuators}
-    )
+    _register(f"HardMove{n_actuators}-v0", "hard_move:HardMoveEnv", max_episode_steps=30, kwargs={"n_actuators": n_actuators})
 
 __all__ = ["ENV_IDS"]

@@ -1,6 +1,8 @@
 """What the environments share: decoding of actions, reset options, noise draws, states and pictures."""
 
 from collections.abc import Callable
+from math import isfinite
+from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
@@ -12,6 +14,11 @@ if TYPE_CHECKING:
 
 # Frames after which a step is cut off; never seen
 FRAME_LIMIT = 10_000
+
+
+def is_number(value: Any) -> bool:
+    """:return: whether this is a single finite number, of Python or NumPy"""
+    return isinstance(value, Real) and isfinite(value)
 
 
 class HybridEnv(gym.Env[np.ndarray, Any]):
@@ -143,7 +150,7 @@ class HybridEnv(gym.Env[np.ndarray, Any]):
         new = {**present, **state}
         generator_state = new.pop("np_random")
         for name, value in new.items():
-            if not np.isscalar(value) or not np.isfinite(value):
+            if not is_number(value):
                 raise ValueError(f"state[{name!r}] must be a finite number, got {value!r}")
         self.np_random.bit_generator.state = generator_state
         self._set_simulator_state({name: float(value) for name, value in new.items()})

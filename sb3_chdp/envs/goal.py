@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from gymnasium import spaces
 
-from sb3_chdp.envs.base import FRAME_LIMIT, HybridEnv
+from sb3_chdp.envs.base import FRAME_LIMIT, HybridEnv, is_number
 from sb3_chdp.envs.soccer import (
     AREA_DEPTH,
     AREA_HALF_WIDTH,
@@ -61,10 +61,11 @@ class GoalEnv(HybridEnv):
 
     | k | action | parameters | range | lasts |
     |---|---|---|---|---|
-    | 0 | kick-to | x of the place to kick to, taken as its y too; the second one has no effect, as in the original | 0 to 40, -15 to 15 | until the ball rests at the player |
+    | 0 | kick-to | x and y of the place to kick to | 0 to 40, -15 to 15 | until the ball rests at the player |
     | 1, 2 | shoot, twice the same | y at which the ball shall cross the goal line | -7.01 to 7.01 | until the episode ends |
 
-    Parameters out of range are clipped.
+    As in the original, kick-to takes its first parameter for y too, and the second has no effect. Parameters out of range are
+    clipped.
 
     ## Observation space
 
@@ -128,11 +129,11 @@ class GoalEnv(HybridEnv):
         self._aim: tuple[float, float] | None = None
 
     def _start(self, options: dict[str, Any]) -> None:
-        player_y = options.get("start")
-        if player_y is not None and not (np.isscalar(player_y) and abs(float(player_y)) <= PITCH_HALF_WIDTH):
+        player_y = options.get("start", 0.0)
+        if not (is_number(player_y) and abs(player_y) <= PITCH_HALF_WIDTH):
             raise ValueError(f"options['start'] must be a height from -15 to 15, got {player_y!r}")
         drawn = self.np_random.uniform(-PITCH_HALF_WIDTH, PITCH_HALF_WIDTH)
-        player_y = drawn if player_y is None else float(player_y)
+        player_y = float(player_y) if "start" in options else drawn
         heading = atan2(-player_y, PITCH_LENGTH)
         reach = KICKABLE - 1e-12
         ball_x, ball_y = reach * cos(heading), player_y + reach * sin(heading)

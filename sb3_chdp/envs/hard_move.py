@@ -40,9 +40,9 @@ class HardMoveEnv(PointMassEnv):
 
     | k | action | parameter | range |
     |---|---|---|---|
-    | 0 to 2^n - 1 | switch on the subset whose bits are those of k, actuator 0 the highest | strength; backwards if negative | -1 to 1 |
+    | 0 to 2^n - 1 | push with a subset of the actuators | strength, backwards if negative | -1 to 1 |
 
-    Actuator i pushes at the angle 2 pi i / n from +x. The force is twice the strength times `motion_table(n)[k]`, the sum
+    The bits of k say which actuators are on, actuator 0 is the highest. Actuator i pushes at the angle 2 pi i / n from +x. The force is twice the strength times `motion_table(n)[k]`, the sum
     of the subset's directions, scaled so that the longest sum has length 1.
 
     ## Observation space

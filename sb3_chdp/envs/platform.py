@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_chdp.envs.base import HybridEnv
+from sb3_chdp.envs.base import HybridEnv, is_number
 
 if TYPE_CHECKING:
     from sb3_chdp.envs.rendering import Canvas
@@ -140,7 +140,7 @@ class PlatformEnv(HybridEnv):
 
     def _start(self, options: dict[str, Any]) -> None:
         x = options.get("start", 0.0)
-        if not np.isscalar(x) or not any(low <= float(x) <= high for low, high in STARTS):
+        if not is_number(x) or not any(low <= x <= high for low, high in STARTS):
             ranges = ", ".join(f"{low:g} to {high:g}" for low, high in STARTS)
             raise ValueError(f"options['start'] must be an x at which the player can stand ({ranges}), got {x!r}")
         self._place_at(float(x))
