@@ -42,8 +42,9 @@ class HardMoveEnv(PointMassEnv):
     |---|---|---|---|
     | 0 to 2^n - 1 | push with a subset of the actuators | strength, backwards if negative | -1 to 1 |
 
-    The bits of k say which actuators are on, actuator 0 is the highest. Actuator i pushes at the angle 2 pi i / n from +x. The force is twice the strength times `motion_table(n)[k]`, the sum
-    of the subset's directions, scaled so that the longest sum has length 1.
+    The bits of k say which actuators are on, actuator 0 is the highest. Actuator i pushes at the angle 2 pi i / n from +x. The
+    force is twice the strength times `motion_table(n)[k]`, the sum of the subset's directions, scaled so that the longest sum
+    has length 1.
 
     ## Observation space
 
