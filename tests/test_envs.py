@@ -2,6 +2,7 @@
 
 import copy
 import importlib.util
+import inspect
 import pickle
 import subprocess
 import sys
@@ -333,3 +334,14 @@ def test_ids_alone():
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.stdout.split() == ["True"], result.stderr
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_pages_name_all_arguments_and_options(env_id):
+    env_class = type(gym.make(env_id).unwrapped)
+    page = env_class.__doc__.split("## Arguments")[1]
+    for name, parameter in list(inspect.signature(env_class).parameters.items()):
+        assert f"| `{name}` | {str(parameter.default).strip()} |" in page
+    if env_id != "HardGoal-v0":  # which refers to Goal's
+        options = page.split("## Reset options")[1]
+        assert all(f"| `{name}` |" in options for name in env_class.option_names)
