@@ -1,5 +1,5 @@
 """
-The published models and the pictures of them, from the runs that reproduce.py has left on this machine.
+The published models, from the runs that reproduce.py has left on this machine.
 
     python benchmarks/release.py                      for every environment CHDP's best seed, and HyAR-TD3 on Hard Move 6
     sb3-chdp enjoy --env Goal-v0 -f benchmarks/models      watch one
@@ -12,10 +12,8 @@ import argparse
 import zipfile
 from pathlib import Path
 
-import gymnasium as gym
 import torch as th
 from cells import ALGORITHMS, RESULTS, ROOT
-from PIL import Image
 from stable_baselines3.common.base_class import BaseAlgorithm
 from tables import read_runs, scores_of
 
@@ -23,10 +21,6 @@ from sb3_chdp import CHDP
 from sb3_chdp.envs import ENV_IDS
 
 PUBLISHED = [("chdp", env_id) for env_id in ENV_IDS] + [("hyar_td3", "HardMove6-v0")]
-GIFS = ROOT.parent / "docs" / "images"
-GIF_WIDTH, MAX_PICTURES, EPISODES = 240, 120, 5
-# Of the environments whose steps have many frames
-FRAMES_PER_PICTURE = {"Platform-v0": 12, "Goal-v0": 5, "HardGoal-v0": 5}
 
 
 def shrink(model: BaseAlgorithm) -> None:
@@ -53,33 +47,6 @@ def save_compressed(model: BaseAlgorithm, path: Path) -> None:
             archive.writestr(name, content)
 
 
-def record_gif(model: BaseAlgorithm, env_id: str, path: Path) -> None:
-    """A GIF of a few episodes of deterministic actions."""
-    env = gym.make(env_id, render_mode="rgb_array")
-    stride = FRAMES_PER_PICTURE.get(env_id, 1)
-    pictures: list[Image.Image] = []
-    n_frames = 0
-
-    def take_picture() -> None:
-        nonlocal n_frames
-        n_frames += 1
-        if n_frames % stride == 0 and len(pictures) < MAX_PICTURES:
-            picture = Image.fromarray(env.unwrapped.render())
-            pictures.append(picture.resize((GIF_WIDTH, GIF_WIDTH * picture.height // picture.width)).quantize(32))
-
-    env.unwrapped.frame_callback = take_picture
-    for episode in range(EPISODES):
-        obs, _ = env.reset(seed=episode)
-        over = False
-        while not over:
-            action, _ = model.predict(obs, deterministic=True)
-            obs, _, terminated, truncated, _ = env.step(action)
-            over = terminated or truncated
-    env.close()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=80, loop=0, optimize=True)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--results", type=Path, default=RESULTS / "main")
@@ -95,8 +62,6 @@ def main() -> None:
         shrink(model)
         path = ROOT / "models" / algo / f"{env_id}_1" / f"{env_id}.zip"
         save_compressed(model, path)
-        if algo == "chdp":
-            record_gif(model, env_id, GIFS / f"{env_id}.gif")
         print(f"{algo} {env_id}: {zips[-1].stem}, {path.stat().st_size / 1e6:.2f} MB")
 
 

@@ -5,7 +5,6 @@ The paper's tables, with our own numbers (also ``sb3-chdp benchmark``).
     python benchmarks/reproduce.py main --algos chdp --envs HardMove6-v0 --seeds 10 11 12
     python benchmarks/reproduce.py ablation --jobs 2                     5 variants of CHDP x 2 environments, paper's settings
     python benchmarks/reproduce.py ablation_tuned --jobs 2               the same with the settings of the YAML file
-    python benchmarks/reproduce.py expressivity                          actions of the published models: expressivity.py
 
 Every cell appends its evaluations to results/<table>/<row>/<environment>/seed_<k>.csv and leaves its settings, versions and
 commit beside it when it is done. Finished cells are skipped, interrupted ones go on from their last checkpoint (with fresh
@@ -20,7 +19,6 @@ import signal
 import time
 from pathlib import Path
 
-import expressivity
 import yaml
 from cells import ALGORITHMS, RESULTS, Cell, run_cell
 from rich.live import Live
@@ -106,7 +104,7 @@ def overview(cells: list[Cell], started: float) -> Table:
 
 def parse_args() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("table", choices=["main", "ablation", "ablation_tuned", "expressivity"])
+    parser.add_argument("table", choices=["main", "ablation", "ablation_tuned"])
     parser.add_argument("--algos", nargs="+", default=list(ALGORITHMS), choices=list(ALGORITHMS), help="of the main table")
     parser.add_argument("--variants", nargs="+", default=list(ABLATION), choices=list(ABLATION), help="of the ablations")
     parser.add_argument("--envs", nargs="+", choices=ENV_IDS, metavar="ENV", help=", ".join(ENV_IDS))
@@ -123,9 +121,6 @@ def parse_args() -> argparse.Namespace:
 
 def main() -> None:
     args = parse_args()
-    if args.table == "expressivity":
-        expressivity.main()
-        return
     os.environ["OMP_NUM_THREADS"] = str(args.threads)  # of the worker processes
     cells = make_cells(args)
     started = time.time()

@@ -51,6 +51,9 @@ def prepare_arguments(command: str, arguments: list[str]) -> list[str]:
     from sb3_chdp.zoo import HYPERPARAMS_FOLDER
 
     arguments = list(arguments)
+    if command in ("plot", "all_plots"):
+        # The scripts that read folders do not know how rl_zoo3 names that of an id with a slash
+        arguments = [argument.replace("sb3_chdp/", "sb3_chdp-") for argument in arguments]
     short_name = ("-a",) if command == "plot" else ()
     if command in WITH_ALGO and _option(arguments, "--algo", *short_name) is None:
         arguments = ["--algo", "chdp", *arguments]
@@ -90,6 +93,12 @@ def main() -> None:
     from sb3_chdp.zoo import register
 
     register()
+    if command == "record":
+        from stable_baselines3.common import vec_env
+
+        from sb3_chdp.envs.recorder import FrameVideoRecorder
+
+        vec_env.VecVideoRecorder = FrameVideoRecorder  # type: ignore[misc]
     sys.argv = [f"sb3-chdp {command}", *prepare_arguments(command, arguments)]
     runpy.run_module(SCRIPTS[command], run_name="__main__", alter_sys=True)
 

@@ -135,6 +135,7 @@ def test_without_the_zoo_extra(tmp_path):
 @pytest.mark.parametrize("path", sorted(HYPERPARAMS.glob("*.yml")), ids=lambda path: path.name)
 def test_yaml_files_have_all_environments(path):
     settings = yaml.safe_load(path.read_text())
-    assert set(settings) == {"default", *ENV_IDS}
+    assert set(settings) == {"default", *ENV_IDS, *(f"sb3_chdp/{env_id}" for env_id in ENV_IDS)}
+    assert all(settings[env_id] == settings[f"sb3_chdp/{env_id}"] for env_id in ENV_IDS)
     for env_settings in settings.values():
         assert {"n_timesteps", "policy"} <= set(env_settings)

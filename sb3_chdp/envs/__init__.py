@@ -1,6 +1,9 @@
 """The eight benchmarks of the paper, registered with Gymnasium on import."""
 
+from typing import Any
+
 import gymnasium as gym
+from gymnasium.envs.registration import WrapperSpec
 
 ENV_IDS = (
     "Platform-v0",
@@ -12,19 +15,28 @@ ENV_IDS = (
     "HardMove8-v0",
     "HardMove10-v0",
 )
+# The count of the step limit belongs to the state of an episode
+_STATE_OF_LIMIT = WrapperSpec("StatefulTimeLimit", "sb3_chdp.envs.time_limit:StatefulTimeLimit", {})
 
+
+def _register(name: str, entry_point: str, **kwargs: Any) -> None:
+    """Register under the full id of this package, and under the bare one unless another package has taken it."""
+    entry_point = f"sb3_chdp.envs.{entry_point}"
+    for env_id in (f"sb3_chdp/{name}", name):
+        present = gym.registry.get(env_id)
+        if present is None:
+            gym.register(env_id, entry_point, additional_wrappers=(_STATE_OF_LIMIT,), **kwargs)
+        elif present.entry_point != entry_point:
+            gym.logger.warn(f"{env_id} is {present.entry_point}, registered before: this package's is sb3_chdp/{name}")
+
+
+_register("Platform-v0", "platform:PlatformEnv", max_episode_steps=200)
 # Goal's limit of 100 steps belongs to its dynamics: it is a termination
-gym.register("Platform-v0", entry_point="sb3_chdp.envs.platform:PlatformEnv", max_episode_steps=200)
-gym.register("Goal-v0", entry_point="sb3_chdp.envs.goal:GoalEnv")
-gym.register("HardGoal-v0", entry_point="sb3_chdp.envs.hard_goal:HardGoalEnv")
-gym.register("CatchPoint-v0", entry_point="sb3_chdp.envs.point_mass:CatchPointEnv", max_episode_steps=25)
-gym.register("HardMove-v0", entry_point="sb3_chdp.envs.point_mass:HardMoveEnv", max_episode_steps=30)
+_register("Goal-v0", "goal:GoalEnv")
+_register("HardGoal-v0", "hard_goal:HardGoalEnv")
+_register("CatchPoint-v0", "catch_point:CatchPointEnv", max_episode_steps=25)
+_register("HardMove-v0", "hard_move:HardMoveEnv", max_episode_steps=30)
 for n_actuators in (4, 6, 8, 10):
-    gym.register(
-        f"HardMove{n_actuators}-v0",
-        entry_point="sb3_chdp.envs.point_mass:HardMoveEnv",
-        max_episode_steps=30,
-        kwargs={"n_actuators": n_actuators},
-    )
+    _register(f"HardMove{n_actuators}-v0", "hard_move:HardMoveEnv", max_episode_steps=30, kwargs={"n_actuators": n_actuators})
 
 __all__ = ["ENV_IDS"]

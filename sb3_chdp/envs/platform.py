@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_chdp.envs.base import HybridEnv
+from sb3_chdp.envs.base import HybridEnv, is_number
 
 if TYPE_CHECKING:
     from sb3_chdp.envs.rendering import Canvas
@@ -21,6 +21,8 @@ MAX_VX, MAX_VX_STANDING, MAX_VY = 100.0, 70.0, 200.0
 DECAY = 0.99
 ENEMY_SPEED = 30.0
 SPEED_NOISE = 0.5 * DT
+# Where the player stands on a platform, clear of its enemy's place at the start
+STARTS = ((0.0, 210.0), (455.0, 710.0), (965.0, 1034.0))
 TAKE_OFF_SPEED = (0.0, 35.0, 25.0)  # run, hop, leap
 RUN_FRAMES = 20
 RUN, HOP, LEAP = 0, 1, 2
@@ -55,70 +57,97 @@ def separate(x: float, y: float, vx: float, vy: float) -> tuple[float, float, fl
 
 class PlatformEnv(HybridEnv):
     """
-    ## Description
-    Run and jump over three platforms with an enemy on each of the first two, and reach the finish line at x = 1035.
-    Every action is a macro-action of many frames of 0.05 s. Positions are pixels, y points up.
+    Run and jump over three platforms with an enemy on each of the first two, and reach the finish line.
+
+    An action lasts many frames of 0.05 s. Positions are pixels, y points up; the finish line is at x = 1035.
 
     ## Action space
+
     `Tuple(Discrete(3), Tuple(Box(0, 30), Box(0, 720), Box(0, 430)))`
 
-    | k | action | parameter | lasts |
-    |---|---|---|---|
-    | 0 | run | acceleration of the 20 frames | 20 frames |
-    | 1 | hop | length (high jump) | until the player stands on a platform |
-    | 2 | leap | length (flat jump) | until the player stands on a platform |
+    | k | action | parameter | range | lasts |
+    |---|---|---|---|---|
+    | 0 | run | acceleration | 0 to 30 | 20 frames |
+    | 1 | hop | length (high jump) | 0 to 720 | until the player stands on a platform |
+    | 2 | leap | length (flat jump) | 0 to 430 | until the player stands on a platform |
+
+    Parameters out of range are clipped.
 
     ## Observation space
-    `Box(-1, 1, (9,))`: player x and velocity, active enemy's x and velocity, widths of the present and the next
-    platform, gap between them, left edge of the present one, height difference (always -1), each scaled to [-1, 1].
+
+    `Box(-1, 1, (9,))`, every quantity scaled to [-1, 1]
+
+    | index | quantity | low, high before scaling |
+    |---|---|---|
+    | 0 | player's x | -20, 1035 |
+    | 1 | player's velocity x | 0, 100 |
+    | 2 | x of the enemy of the present platform | 0, 1035 |
+    | 3 | its velocity | -30, 30 |
+    | 4, 5 | widths of the present and the next platform | 0, 275 |
+    | 6 | gap between them | 0, 235 |
+    | 7 | left edge of the present one | 0, 1035 |
+    | 8 | difference of their heights, always -1 | |
 
     ## Rewards
-    Progress in x divided by 1035. The rewards of an episode add up to x_final / 1035; 1 is success.
+
+    Progress in x divided by 1035. The rewards of an episode that starts at 0 add up to x_final / 1035; 1 is success.
 
     ## Starting state
-    At the left end of the first platform, always the same.
+
+    At the left end of the first platform, the enemies at the right ends of theirs; always the same.
 
     ## Episode end
-    Termination: finish line, a fall or an enemy (`info["outcome"]`: "finish", "fall", "enemy"). Truncation: 200 steps.
-    `info` has `is_success`, `frames` (frames of the step) and, at the end, `outcome`.
+
+    Termination: `info["outcome"]` is "finish" (success), "fall" or "enemy". Truncation: 200 steps.
 
     ## Arguments
-    `noise=False` silences all perturbations inside a transition.
+
+    | argument | default | meaning |
+    |---|---|---|
+    | `noise` | True | False silences all perturbations inside a transition |
+    | `render_mode` | None | None, "human" or "rgb_array" |
+
+    ## Reset options
+
+    | key | meaning | accepted |
+    |---|---|---|
+    | `start` | x at which the player stands | 0 to 210, 455 to 710 or 965 to 1034: on a platform, clear of its enemy |
+
+    ## Version history
+
+    * v0: transitions equal those of the original package gym-platform; observations are scaled as its wrappers do.
 
     ## Source
-    Masson, Ranchod and Konidaris (2016), "Reinforcement Learning with Parameterized Actions"; original package
-    gym-platform. Version 0: transitions equal the original's; observations scaled as its wrappers do.
+
+    Masson, Ranchod and Konidaris (2016), "Reinforcement Learning with Parameterized Actions".
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
-    screen_size = (1035, 300)
-    state_names = ("player_x", "player_y", "player_vx", "player_vy", "enemy1_x", "enemy1_dx", "enemy2_x", "enemy2_dx")
+    screen_size = (800, 240)
+    option_names = ("start",)
+    success_outcome = "finish"
+    action_names = ("run", "hop", "leap")
 
     def __init__(self, noise: bool = True, render_mode: str | None = None):
         super().__init__(noise, render_mode)
         self._set_action_space([[bounds] for bounds in PARAMETER_BOUNDS])
         self.observation_space = spaces.Box(-1.0, 1.0, (9,), dtype=np.float32)
-        self._place_at_start()
+        self._place_at(0.0)
 
-    def _place_at_start(self) -> None:
-        self.x, self.y, self.vx, self.vy = 0.0, GROUND, 0.0, 0.0
+    def _place_at(self, x: float) -> None:
+        self.x, self.y, self.vx, self.vy = x, GROUND, 0.0, 0.0
         self.enemies = [(left + width - PLAYER_WIDTH, -ENEMY_SPEED) for left, width in PLATFORMS[:2]]
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        super().reset(seed=seed)
-        self._place_at_start()
-        if self.frame_callback is not None:
-            self.frame_callback()
-        return self._observation(), {}
+    def _start(self, options: dict[str, Any]) -> None:
+        x = options.get("start", 0.0)
+        if not is_number(x) or not any(low <= x <= high for low, high in STARTS):
+            ranges = ", ".join(f"{low:g} to {high:g}" for low, high in STARTS)
+            raise ValueError(f"options['start'] must be an x at which the player can stand ({ranges}), got {x!r}")
+        self._place_at(float(x))
 
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        k, (parameter,) = self._decode(action)
+    def _advance(self, k: int, parameters: list[float]) -> tuple[float, str, int]:
         low, high = PARAMETER_BOUNDS[k]
-        reward, outcome, frames = self._simulate(k, min(max(parameter, low), high))
-        info: dict[str, Any] = {"is_success": outcome == "finish", "frames": frames}
-        if outcome:
-            info["outcome"] = outcome
-        return self._observation(), reward, bool(outcome), False, info
+        return self._simulate(k, min(max(parameters[0], low), high))
 
     def _simulate(self, k: int, parameter: float) -> tuple[float, str, int]:
         """
@@ -136,6 +165,7 @@ class PlatformEnv(HybridEnv):
         block = 2 * RUN_FRAMES if k == RUN else 300
         draws = iter(self._normals(block))
         gravity_step = -GRAVITY * DT
+        is_watched = self._is_watched
         frames = 0
         outcome = ""
         while True:
@@ -177,15 +207,15 @@ class PlatformEnv(HybridEnv):
 
             if y < GROUND:
                 x, y, vx, vy = separate(x, y, vx, vy)
-            if self.frame_callback is not None:
-                self.x, self.y, self.vx, self.vy = x, y, vx, vy
-                self.frame_callback()
             if x >= FINISH:
                 outcome = "finish"
             elif y < GROUND:
                 outcome = "fall"
             elif y < GROUND + PLAYER_HEIGHT and any(abs(x - enemy[0]) < PLAYER_WIDTH for enemy in self.enemies):
                 outcome = "enemy"
+            if is_watched:
+                self.x, self.y, self.vx, self.vy = x, y, vx, vy
+                self._frame_done(outcome)
             if outcome or (frames == RUN_FRAMES if k == RUN else is_standing(x, y)):
                 break
         self.x, self.y, self.vx, self.vy = x, y, vx, vy
@@ -207,24 +237,44 @@ class PlatformEnv(HybridEnv):
             dtype=np.float32,
         )
 
-    def get_state(self) -> np.ndarray:
-        return np.array([self.x, self.y, self.vx, self.vy, *self.enemies[0], *self.enemies[1]])
+    def _simulator_state(self) -> dict[str, float]:
+        (enemy1_x, enemy1_dx), (enemy2_x, enemy2_dx) = self.enemies
+        return {
+            "player_x": self.x,
+            "player_y": self.y,
+            "player_vx": self.vx,
+            "player_vy": self.vy,
+            "enemy1_x": enemy1_x,
+            "enemy1_dx": enemy1_dx,
+            "enemy2_x": enemy2_x,
+            "enemy2_dx": enemy2_dx,
+        }
 
-    def set_state(self, state: np.ndarray) -> None:
-        self.x, self.y, self.vx, self.vy, *enemies = self._checked_state(state)
-        self.enemies = [(enemies[0], enemies[1]), (enemies[2], enemies[3])]
+    def _set_simulator_state(self, state: dict[str, float]) -> None:
+        self.x, self.y, self.vx, self.vy = (state[f"player_{name}"] for name in ("x", "y", "vx", "vy"))
+        self.enemies = [(state[f"enemy{i}_x"], state[f"enemy{i}_dx"]) for i in (1, 2)]
 
     def _draw(self, canvas: "Canvas") -> None:
-        base = 50.0
+        from sb3_chdp.envs.rendering import GREY, INK, RED, WHITE
+
+        scale, margin, base = 0.74, 12.0, 30.0
+
+        def box(x: float, y: float, width: float, height: float, colour: tuple[int, int, int], rounding: float = 0) -> None:
+            canvas.rectangle((margin + scale * x, base + scale * y), (scale * width, scale * height), colour, rounding)
+
         canvas.clear((214, 234, 248))
         for left, width in PLATFORMS:
-            canvas.rectangle((left, base), (width, GROUND), (139, 94, 60))
-            canvas.rectangle((left, base + GROUND - 6), (width, 6), (86, 152, 72))
-        canvas.line((FINISH - 2, base + GROUND), (FINISH - 2, base + GROUND + 90), (40, 40, 40), 3)
-        canvas.polygon([(FINISH - 3, 180.0), (FINISH - 3, 160.0), (FINISH - 28, 170.0)], (214, 57, 57))
+            box(left, -30, width, GROUND + 30, (139, 94, 60))
+            box(left, GROUND - 8, width, 8, (86, 152, 72))
+        pole = margin + scale * (FINISH - 2)
+        canvas.line((pole, base + scale * GROUND), (pole, base + scale * 130), INK, 3)
+        canvas.polygon([(pole - 1, base + scale * y) for y in (130, 104)] + [(pole - 24, base + scale * 117)], RED)
         for enemy_x, _ in self.enemies:
-            canvas.rectangle((enemy_x, base + GROUND), (PLAYER_WIDTH, PLAYER_HEIGHT), (110, 110, 110))
-            canvas.rectangle((enemy_x, base + GROUND + 18), (PLAYER_WIDTH, 6), (200, 40, 40))
-        canvas.rectangle((self.x, base + self.y), (PLAYER_WIDTH, PLAYER_HEIGHT), (118, 68, 164))
-        canvas.rectangle((self.x + 11, base + self.y + 18), (6, 6), (255, 255, 255))
-        canvas.text(f"x = {self.x:.0f} / {FINISH:.0f}", (10, 14))
+            box(enemy_x, GROUND, PLAYER_WIDTH, PLAYER_HEIGHT, (90, 90, 90), 3)
+            box(enemy_x, GROUND + 17, PLAYER_WIDTH, 7, RED)
+        box(self.x, self.y, PLAYER_WIDTH, PLAYER_HEIGHT, (118, 68, 164), 3)
+        box(self.x + 11, self.y + 17, 7, 7, WHITE, 3)
+        canvas.text(f"x {self.x:.0f} of {FINISH:.0f}", (margin, 190))
+        canvas.rectangle((150, 186), (638, 8), GREY, 4)
+        canvas.rectangle((150, 186), (638 * self.x / FINISH, 8), (118, 68, 164), 4)
+        canvas.text(self._action_text(), (margin, 220))

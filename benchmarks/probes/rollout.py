@@ -1,0 +1,71 @@
+"""Episodes of the published models, for the scripts beside this one."""
+
+import argparse
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_chdp import CHDP
+
+BENCHMARKS = Path(__file__).parent.parent
+FIGURES = BENCHMARKS / "figures"
+
+
+class Episode(NamedTuple):
+    """
+    :param observations: what the model saw, one per action
+    :param actions: native actions
+    :param success: ``is_success`` of the last step
+    """
+
+    observations: list[np.ndarray]
+    actions: list[Any]
+    success: bool
+
+
+def load_model(env_id: str, algorithm: type[BaseAlgorithm] = CHDP, path: str | None = None) -> BaseAlgorithm:
+    """
+    :param env_id: environment, without the namespace
+    :param algorithm: class of the model
+    :param path: zip of a model; the published one if None
+    :return: the model, on the CPU
+    """
+    folders = {"CHDP": "chdp", "HyARTD3": "hyar_td3"}
+    return algorithm.load(path or BENCHMARKS / "models" / folders[algorithm.__name__] / f"{env_id}_1" / env_id, device="cpu")
+
+
+def make_env(env_id: str, **kwargs: Any) -> gym.Env:
+    """:return: this package's environment, even if another package has taken the bare id"""
+    return gym.make(f"sb3_chdp/{env_id}", **kwargs)
+
+
+def play(
+    model: Any, env: gym.Env, seed: int | None = None, options: dict[str, Any] | None = None, deterministic: bool = True
+) -> Episode:
+    """
+    Play one episode.
+
+    :param model: anything with ``predict``
+    :param env: environment with native actions
+    :param seed: of the reset
+    :param options: of the reset
+    :param deterministic: whether the model acts so
+    :return: the episode
+    """
+    obs, _ = env.reset(seed=seed, options=options)
+    observations, actions, over, info = [], [], False, {}
+    while not over:
+        action, _ = model.predict(obs, deterministic=deterministic)
+        observations.append(obs)
+        actions.append(action)
+        obs, _, terminated, truncated, info = env.step(action)
+        over = terminated or truncated
+    return Episode(observations, actions, info["is_success"])
+
+
+def parser_of(description: str | None) -> argparse.ArgumentParser:
+    """:return: a parser that shows the docstring of a script as it is"""
+    return argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
