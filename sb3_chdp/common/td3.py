@@ -46,9 +46,9 @@ class HybridTD3Policy(HybridPolicy, TD3Policy):
     """
     SB3's TD3 policy on the rows of a hybrid action space.
 
-    Arguments not listed here are those of :class:`stable_baselines3.td3.policies.TD3Policy`.
+    Arguments not listed here are those of :class:`stable_baselines3.td3.policies.TD3Policy`; ``optimizer_kwargs`` are
+    ``fused=True`` for Adam if None.
 
-    :param optimizer_kwargs: keyword arguments of the optimizers, without the learning rate; ``fused=True`` for Adam if None
     :param inverting_gradients: whether to invert the gradients at the actor's output
     """
 
