@@ -19,7 +19,8 @@ def save_buffer(buffer: ReplayBuffer, path: PathOrFile) -> bool:
     :return: whether it was written; not if it can only be pickled (a class or an entry that is not SB3's or this package's)
     """
     # Python 3.10 has no default __getstate__
-    state = dict(buffer.__getstate__() if hasattr(buffer, "__getstate__") else vars(buffer))
+    get_state = getattr(buffer, "__getstate__", None)
+    state: dict[str, Any] = dict(vars(buffer) if get_state is None else get_state())
     state.pop("device", None)
     arrays: list[np.ndarray] = []
     try:

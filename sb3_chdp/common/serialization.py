@@ -52,8 +52,8 @@ ARGUMENTS: dict[type, Callable[[Any], dict[str, Any]]] = {
     TrainFreq: lambda frequency: frequency._asdict(),
     deque: lambda queue: {"iterable": list(queue), "maxlen": queue.maxlen},
 }
-# Attributes that objects have beside their arguments
-STATE: dict[type, str] = {OrnsteinUhlenbeckActionNoise: "noise_prev", VectorizedActionNoise: "noises"}
+# Attributes that objects have beside their arguments (setting ``noises`` would reset them)
+STATE: dict[type, str] = {OrnsteinUhlenbeckActionNoise: "noise_prev", VectorizedActionNoise: "_noises"}
 CONSTRUCTORS = {kind.__name__: kind for kind in ARGUMENTS}
 ENUMS: dict[str, type[enum.Enum]] = {kind.__name__: kind for kind in (TrainFrequencyUnit, GoalSelectionStrategy)}
 
@@ -127,6 +127,8 @@ def encode(value: Any, arrays: list[np.ndarray] | None = None) -> Any:
         return {key: encode(item, arrays) for key, item in value.items()}
     if kind is tuple:
         return {TAG: "tuple", "items": [encode(item, arrays) for item in value]}
+    if kind in (OrderedDict, spaces.Dict):
+        return {TAG: kind.__name__, "items": [[encode(key, arrays), encode(item, arrays)] for key, item in value.items()]}
     if kind is np.ndarray:
         return _encode_array(value, arrays)
     if isinstance(value, np.generic):
@@ -134,8 +136,6 @@ def encode(value: Any, arrays: list[np.ndarray] | None = None) -> Any:
     if kind in ARGUMENTS:
         entry = {TAG: kind.__name__, "arguments": encode(ARGUMENTS[kind](value), arrays)}
         return {**entry, "state": encode(getattr(value, STATE[kind]), arrays)} if kind in STATE else entry
-    if kind is spaces.Dict:
-        return {TAG: "Dict", "items": [[encode(key), encode(space)] for key, space in value.spaces.items()]}
     if isinstance(value, HybridBox):
         constructor, arguments = value.__reduce__()
         return {TAG: "hybrid_space", "class": encode(constructor), "arguments": encode(list(arguments), arrays)}
@@ -177,6 +177,7 @@ def decode(value: Any, arrays: list[np.ndarray] | None = None) -> Any:
         return made
     readers: dict[Any, Callable[[], Any]] = {
         "tuple": lambda: tuple(decode(value["items"], arrays)),
+        "OrderedDict": lambda: OrderedDict((decode(key, arrays), decode(item, arrays)) for key, item in value["items"]),
         "array": lambda: _decode_array(value),
         "array_file": lambda: (arrays or [])[value["index"]],
         "number": lambda: _decode_array(value["array"])[()],
