@@ -1,11 +1,19 @@
-"""Griffe extension: the Sphinx roles of docstrings (``:class:`X```) become links, or code where the docs have no page on X."""
+"""
+Griffe extension that makes Markdown of docstrings: Sphinx roles (``:class:`X```) become links, or code where the docs have
+no page on X, and indented lists become lists.
+"""
 
 import re
+import textwrap
 from typing import Any
 
 import griffe
 
 ROLE = re.compile(r":(?:py:)?(?:class|func|meth|mod|attr|data|exc|obj):`~?(?P<target>[^`<>]+)`")
+
+
+# A list that follows a line with a colon, indented as in reStructuredText
+INDENTED_LIST = re.compile(r":\n(?P<items> {4}1\. .*(?:\n {4}.*)*)")
 
 
 def _identifier(target: str, scope: griffe.Object) -> str:
@@ -43,15 +51,20 @@ def replace_roles(text: str, scope: griffe.Object) -> str:
     return ROLE.sub(link, text)
 
 
-class SphinxRoles(griffe.Extension):
-    """Replaces the roles in every docstring of a package once all of it is loaded."""
+def set_off_lists(text: str) -> str:
+    """:return: the docstring with lists as Markdown wants them: after an empty line, not indented"""
+    return INDENTED_LIST.sub(lambda match: ":\n\n" + textwrap.dedent(match["items"]), text)
+
+
+class Docstrings(griffe.Extension):
+    """Works on every docstring of a package once all of it is loaded."""
 
     def on_package(self, *, pkg: griffe.Module, **kwargs: Any) -> None:
         self._visit(pkg)
 
     def _visit(self, scope: griffe.Object) -> None:
         if scope.docstring is not None:
-            scope.docstring.value = replace_roles(scope.docstring.value, scope)
+            scope.docstring.value = set_off_lists(replace_roles(scope.docstring.value, scope))
         for member in scope.members.values():
             if not member.is_alias:
                 self._visit(member)
