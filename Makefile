@@ -5,16 +5,16 @@ SHELL := bash
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-SOURCES := sb3_chdp tests benchmarks
+SOURCES := sb3_chdp tests benchmarks docs
 # Small networks are fastest on one thread
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: train test format lint type check-codestyle docs speed clean-env
+.PHONY: train test format lint type check-codestyle docs package hooks speed clean-env
 
 $(STAMP): setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .[zoo,render,plots,tests]
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .[zoo,render,plots,tests,docs]
 	touch $(STAMP)
 
 train: $(STAMP)
@@ -38,8 +38,15 @@ type: $(STAMP)
 	$(BIN)/mypy sb3_chdp
 
 docs: $(STAMP)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .[docs]
 	$(BIN)/mkdocs build --strict
+
+package: $(STAMP)
+	rm -rf dist
+	$(BIN)/python -m build
+	$(BIN)/twine check --strict dist/*
+
+hooks: $(STAMP)
+	$(BIN)/pre-commit install
 
 speed: $(STAMP)
 	$(BIN)/python benchmarks/speed.py

@@ -8,6 +8,7 @@ The command ``sb3-chdp``: rl_zoo3's scripts with the algorithms and environments
     sb3-chdp plot --env Platform-v0 -f logs -y success     learning curves
     sb3-chdp all_plots | plot_from_file | record_training   the other scripts of rl_zoo3
     sb3-chdp benchmark main --jobs 2             reproduce the paper's tables (in a clone of the repository)
+    sb3-chdp --version
 """
 
 import importlib.util
@@ -15,6 +16,8 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
+
+from sb3_chdp import __version__
 
 SCRIPTS = {
     "train": "rl_zoo3.train",
@@ -79,6 +82,9 @@ def main() -> None:
     """Entry point of ``sb3-chdp`` and ``python -m sb3_chdp``."""
     if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
         print(__doc__)
+        return
+    if sys.argv[1] == "--version":
+        print(f"sb3_chdp {__version__}")
         return
     command, arguments = sys.argv[1], sys.argv[2:]
     if command not in (*SCRIPTS, "benchmark"):

@@ -32,6 +32,11 @@ def test_wheel(tmp_path):
     assert result[-3:] == [str(tmp_path / "site" / "sb3_chdp" / "__init__.py"), sb3_chdp.__version__, "True"]
 
 
+def test_version_of_the_command():
+    result = subprocess.run([sys.executable, "-m", "sb3_chdp", "--version"], check=True, capture_output=True, text=True)
+    assert result.stdout == f"sb3_chdp {sb3_chdp.__version__}\n"
+
+
 def test_import_is_light():
     """Importing the package imports neither rl_zoo3, which patches Gymnasium, nor pygame."""
     code = "import sys, sb3_chdp; print([m for m in ('rl_zoo3', 'pygame', 'optuna', 'matplotlib.pyplot') if m in sys.modules])"

@@ -18,9 +18,9 @@ class Candidates(NamedTuple):
     """
     n hybrid actions for each of B observations.
 
-    :param latents: (B, n, latent_dim)
-    :param discrete_actions: (B, n)
-    :param parameters: (B, n, Pmax), padding 0
+    :ivar latents: (B, n, latent_dim)
+    :ivar discrete_actions: (B, n)
+    :ivar parameters: (B, n, Pmax), padding 0
     """
 
     latents: th.Tensor

@@ -2,18 +2,19 @@
 
 import io
 import pathlib
+from collections.abc import Iterable
 from typing import Any, TypeVar
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecCheckNan, VecEnv, is_vecenv_wrapped
 
 from sb3_chdp.common.checks import check_policy_kwargs
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.native_env import NativeActionVecEnv
+from sb3_chdp.common.safe_zip import VERSION, misfit, read_model, save_model
 
 SelfHybridAlgorithm = TypeVar("SelfHybridAlgorithm", bound="HybridAlgorithm")
 
@@ -79,6 +80,26 @@ class HybridAlgorithm(BaseAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "hybrid_space", "_native_env"]
 
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Save all the attributes of the object and the model parameters in a zip-file.
+
+        Attributes are JSON where they can be, so that :meth:`load` runs no code of the file's. Custom objects are pickled, as
+        SB3 does it, and need ``load(..., trusted=True)``.
+
+        :param path: path to the file where the rl agent should be saved
+        :param exclude: name of parameters that should be excluded in addition to the default ones
+        :param include: name of parameters that might be excluded but should be included anyway
+        """
+        sb3_zip = io.BytesIO()
+        super().save(sb3_zip, exclude, include)
+        save_model(sb3_zip, self, path)
+
     @classmethod
     def load(
         cls: type[SelfHybridAlgorithm],
@@ -88,13 +109,29 @@ class HybridAlgorithm(BaseAlgorithm):
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
         force_reset: bool = True,
+        trusted: bool = False,
         **kwargs: Any,
     ) -> SelfHybridAlgorithm:
-        data, _, _ = load_from_zip_file(path, device="cpu", custom_objects=custom_objects)
-        if not isinstance(path, (str, pathlib.Path)):
-            path.seek(0)
-        saved_class = (data or {}).get("policy_class")
-        accepted = tuple(cls.policy_aliases.values())
-        if not (isinstance(saved_class, type) and issubclass(saved_class, accepted)):
-            raise ValueError(f"{path} is not a {cls.__name__} model: its policy is {saved_class}, not one of {accepted}")
-        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        """
+        Load the model from a zip-file. No code of the file's runs unless it is ``trusted``.
+
+        :param path: path to the file (or a file-like) where to load the agent from
+        :param env: the new environment to run the loaded model on (can be None if you only need prediction from a trained
+            model) has priority over any saved environment
+        :param device: Device on which the code should run.
+        :param custom_objects: objects to use in place of those of the file, by attribute; what is named here is not read
+        :param print_system_info: Whether to print system info from the saved model and the current system info
+        :param force_reset: Force call to ``reset()`` before training to avoid unexpected behavior.
+        :param trusted: whether pickled objects may be read, which runs whatever code the file's author put there
+        :param kwargs: extra arguments to change the model when loading
+        :return: new model instance with loaded parameters
+        :raises ValueError: if the file is of another class or of a version that does not fit, or if it holds pickled objects
+            and is not trusted
+        """
+        file, objects, version = read_model(cls, path, custom_objects, trusted)
+        try:
+            return super().load(file, env, device, objects, print_system_info, force_reset, **kwargs)
+        except (AttributeError, LookupError, RuntimeError, TypeError) as error:
+            if version == VERSION:
+                raise
+            raise misfit(path, version, error) from error

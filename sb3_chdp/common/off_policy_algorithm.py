@@ -1,5 +1,7 @@
 """What SB3's OffPolicyAlgorithm needs to work with the user's own hybrid action space."""
 
+import io
+import pathlib
 from typing import Any, TypeVar
 
 import numpy as np
@@ -10,9 +12,12 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.her import HerReplayBuffer
 
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
+from sb3_chdp.common.buffer_file import load_buffer, save_buffer
 from sb3_chdp.common.policies import HybridPolicy
+from sb3_chdp.common.safe_zip import refuse
 from sb3_chdp.common.samples import HybridReplaySamples, name_columns
 
 SelfHybridOffPolicyAlgorithm = TypeVar("SelfHybridOffPolicyAlgorithm", bound="HybridOffPolicyAlgorithm")
@@ -119,6 +124,42 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """
+        Save the replay buffer as JSON and arrays. A custom one is pickled, as SB3 does it, and needs
+        ``load_replay_buffer(..., trusted=True)``.
+
+        :param path: the file; SB3's suffix ``.pkl`` is appended if there is none
+        """
+        assert self.replay_buffer is not None, "The replay buffer is not defined"
+        if not save_buffer(self.replay_buffer, path):
+            super().save_replay_buffer(path)
+
+    def load_replay_buffer(
+        self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True, trusted: bool = False
+    ) -> None:
+        """
+        Load a replay buffer. No code of the file's runs unless it is ``trusted``.
+
+        :param path: the file
+        :param truncate_last_traj: for ``HerReplayBuffer``: whether the last trajectory in the buffer counts as finished
+        :param trusted: whether a pickled file may be read, which runs whatever code the file's author put there
+        :raises ValueError: if the file is of a version that does not fit, or if it is pickled and not trusted
+        """
+        buffer = load_buffer(path)
+        if buffer is None:
+            if not trusted:
+                raise refuse(path, "holds a replay buffer in pickled form")
+            super().load_replay_buffer(path, truncate_last_traj)
+            return
+        self.replay_buffer = buffer
+        if isinstance(buffer, HerReplayBuffer):
+            assert self.env is not None, "You must pass an environment at load time when using `HerReplayBuffer`"
+            buffer.set_env(self.env)
+            if truncate_last_traj:
+                buffer.truncate_last_trajectory()
+        buffer.device = self.device
 
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
         """SB3's ``collect_rollouts``, in which actions are rows."""

@@ -1,6 +1,8 @@
 """Policies that answer in the user's own action space."""
 
-from typing import Any
+import io
+import pathlib
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
@@ -9,6 +11,9 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
 
 from sb3_chdp.common.checks import check_finite
 from sb3_chdp.common.hybrid_box import HybridBox
+from sb3_chdp.common.safe_zip import load_policy, refuse, save_policy
+
+SelfHybridPolicy = TypeVar("SelfHybridPolicy", bound="HybridPolicy")
 
 
 class HybridPolicy(BasePolicy):
@@ -74,6 +79,38 @@ class HybridPolicy(BasePolicy):
         with th.no_grad():
             rows = self._predict(obs_tensor, deterministic=deterministic, **kwargs)
         return rows.cpu().numpy(), vectorized_env
+
+    def save(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """
+        Save the policy, its arguments as JSON. Custom ones are pickled, as SB3 does it, and need ``load(..., trusted=True)``.
+
+        :param path: the file
+        """
+        if not save_policy(self, path):
+            super().save(path)  # type: ignore[arg-type]
+
+    @classmethod
+    def load(
+        cls: type[SelfHybridPolicy],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        device: th.device | str = "auto",
+        trusted: bool = False,
+    ) -> SelfHybridPolicy:
+        """
+        Load the policy. No code of the file's runs unless it is ``trusted``.
+
+        :param path: the file
+        :param device: Device on which the policy should be loaded.
+        :param trusted: whether a pickled file may be read, which runs whatever code the file's author put there
+        :return: the policy
+        :raises ValueError: if the file is of another class or version, or if it is pickled and not trusted
+        """
+        policy = load_policy(cls, path, device)
+        if policy is None:
+            if not trusted:
+                raise refuse(path, "holds a policy in pickled form")
+            policy = super().load(path, device)  # type: ignore[arg-type]
+        return policy
 
     @property
     def noise_dim(self) -> int:

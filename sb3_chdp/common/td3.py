@@ -48,9 +48,9 @@ class HybridTD3Policy(HybridPolicy, TD3Policy):
     SB3's TD3 policy with an actor whose output stands for hybrid actions. Subclasses say how: by ``_predict``, which
     returns rows, and ``_noisy_rows``.
 
-    Arguments not listed here are those of :class:`stable_baselines3.td3.policies.TD3Policy`.
+    Arguments not listed here are those of :class:`stable_baselines3.td3.policies.TD3Policy`; ``optimizer_kwargs`` are
+    ``fused=True`` for Adam if None.
 
-    :param optimizer_kwargs: keyword arguments of the optimizers, without the learning rate; ``fused=True`` for Adam if None
     :param inverting_gradients: whether to invert the gradients at the actor's output
     """
 

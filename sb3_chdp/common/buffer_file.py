@@ -1,0 +1,73 @@
+"""Replay buffers as a zip of JSON and NumPy arrays."""
+
+import json
+import zipfile
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.save_util import open_path
+
+from sb3_chdp.common.safe_zip import HEADER, PathOrFile, is_path, make_header, read_header
+from sb3_chdp.common.serialization import NotSerializable, decode, encode
+
+
+def save_buffer(buffer: ReplayBuffer, path: PathOrFile) -> bool:
+    """
+    :param buffer: a replay buffer
+    :param path: where to write it to; SB3's suffix ``.pkl`` is appended if there is none
+    :return: whether it was written; not if it can only be pickled (a class or an entry that is not SB3's or this package's)
+    """
+    # Python 3.10 has no default __getstate__
+    get_state = getattr(buffer, "__getstate__", None)
+    state: dict[str, Any] = dict(vars(buffer) if get_state is None else get_state())
+    state.pop("device", None)
+    arrays: list[np.ndarray] = []
+    try:
+        data = encode({"class": type(buffer), "state": state}, arrays)
+    except NotSerializable:
+        return False
+    file = open_path(path, "w", suffix="pkl")
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr(HEADER, make_header(buffer))
+        archive.writestr("data", json.dumps(data, indent=4))
+        for i, array in enumerate(arrays):
+            with archive.open(f"{i}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, array, allow_pickle=False)
+    if is_path(path):
+        file.close()
+    return True
+
+
+def load_buffer(path: PathOrFile) -> ReplayBuffer | None:
+    """
+    :param path: the file
+    :return: the replay buffer, None if the file was not written by :func:`save_buffer`
+    :raises ValueError: for a file of a version that this one does not read
+    """
+    file: Any = open_path(path, "r", suffix="pkl")
+    start = file.tell()
+    try:
+        if not zipfile.is_zipfile(file):
+            return None
+        with zipfile.ZipFile(file) as archive:
+            if read_header(archive, ReplayBuffer, path) is None:
+                return None
+            names = sorted((name for name in archive.namelist() if name.endswith(".npy")), key=lambda name: int(name[:-4]))
+            data = json.loads(archive.read("data"))
+            arrays = []
+            for name in names:
+                with archive.open(name) as entry:
+                    arrays.append(np.lib.format.read_array(entry, allow_pickle=False))
+    finally:
+        file.seek(start) if not is_path(path) else file.close()
+    content = decode(data, arrays)
+    kind = content["class"]
+    if not (isinstance(kind, type) and issubclass(kind, ReplayBuffer)):
+        raise ValueError(f"{path} does not hold a replay buffer but a {kind}")
+    buffer = kind.__new__(kind)
+    if hasattr(buffer, "__setstate__"):
+        buffer.__setstate__(content["state"])
+    else:
+        vars(buffer).update(content["state"])
+    return buffer
