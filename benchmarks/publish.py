@@ -25,7 +25,9 @@ ROOT = Path(__file__).parent
 RESULTS = ROOT / "results"
 README = ROOT / "README.md"
 FIGURES = ROOT / "figures"
-PROTOCOL_HEADER = "# Written by benchmarks/publish.py from the files of the runs; what the keys mean: paper.py beside this file.\n"
+PROTOCOL_HEADER = (
+    "# Written by benchmarks/publish.py from the files of the runs; what the keys mean: paper.py beside this file.\n"
+)
 
 
 def replace_section(path: Path, name: str, text: str) -> None:

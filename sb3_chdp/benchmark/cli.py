@@ -67,14 +67,15 @@ def parse(arguments: list[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
     :return: arguments, and parameters for submitit
     """
     parser = make_parser()
-    args, rest = parser.parse_known_args(arguments)
-    options: dict[str, Any] = {}
-    words = iter([part for word in rest for part in (word.split("=", 1) if word.startswith(SLURM) else [word])])
+    rest, options = [], {}
+    words = iter(arguments)
     for word in words:
-        value = next(words, None) if word.startswith(SLURM) else None
-        if value is None:
-            parser.error(f"unrecognized argument {word}")
-        options[word[2:].replace("-", "_")] = yaml.safe_load(value)
+        if not word.startswith(SLURM):
+            rest.append(word)
+            continue
+        name, _, value = word.partition("=")
+        options[name[2:].replace("-", "_")] = yaml.safe_load(value or next(words, ""))
+    args = parser.parse_args(rest)
     if options and args.cluster != "slurm":
         parser.error(f"{SLURM}... needs --cluster slurm")
     if args.what == "run" and not (args.envs and args.algos):
@@ -136,7 +137,7 @@ def train_all(runs: list[Run], args: argparse.Namespace, options: dict[str, Any]
     from sb3_chdp.benchmark.manager import settings_of
     from sb3_chdp.benchmark.training import forget
 
-    settings = {}
+    settings: dict[tuple[str, str], dict[str, str]] = {}
     for run in runs:
         # The settings are those of all seeds
         key = (run.name, run.env_id)

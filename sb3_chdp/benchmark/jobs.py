@@ -1,6 +1,7 @@
 """Runs as jobs of submitit: processes of this machine, or jobs of Slurm."""
 
 import os
+import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from sb3_chdp.benchmark.runs import Run
 LOCAL_TIMEOUT_MIN = 60 * 24 * 365
 SLURM_TIMEOUT_MIN = 60 * 24
 CLUSTERS = ("local", "slurm")
+SLURM_LOOK_INTERVAL = 10.0
 
 
 def end_with(pid: int) -> None:
@@ -87,6 +89,9 @@ class Queue:
         self.waiting, self.executor, self.cluster = list(runs), executor, cluster
         self.n_jobs = n_jobs if cluster == "local" else len(runs)
         self.running: list[tuple[Run, submitit.Job[str]]] = []
+        self.last_look = -SLURM_LOOK_INTERVAL
+        self.absent: set[str] = set()
+        self.gone: set[str] = set()
 
     def submit(self) -> None:
         """Submit as many runs as there is room for."""
@@ -98,20 +103,39 @@ class Queue:
 
     def collect(self) -> Iterator[tuple[Run, str, bool]]:
         """:return: run, a line about it, and whether it failed, for every job that has ended since the last call"""
-        for run, job in list(self.running):
-            if not job.done():
-                continue
+        for run, job in self._ended():
             self.running.remove((run, job))
             try:
+                if not job.paths.result_pickle.exists():
+                    raise submitit.core.utils.UncompletedJobError
                 yield run, job.result(), False
             except Exception as error:  # one run that fails must not cost the others
                 yield run, f"{run.folder}: {reason(error)} (log: {job.paths.stderr})", True
+
+    def _ended(self) -> list[tuple[Run, "submitit.Job[str]"]]:
+        """:return: running jobs that run no more"""
+        if self.cluster == "local":
+            return [(run, job) for run, job in self.running if job.done()]
+        # Not job.done(), which needs Slurm's accounting: without it nobody would see that a job was killed
+        if time.monotonic() - self.last_look > SLURM_LOOK_INTERVAL:
+            self.last_look, queued = time.monotonic(), slurm_jobs()
+            if queued is not None:
+                ids = {job.job_id for _, job in self.running}
+                # Absent twice: a result takes a while to be seen on other machines
+                self.gone, self.absent = self.absent & (ids - queued), ids - queued
+        return [(run, job) for run, job in self.running if job.job_id in self.gone or job.paths.result_pickle.exists()]
 
     def cancel(self) -> None:
         """End local jobs; those of Slurm go on without this command."""
         if self.cluster == "local":
             for _, job in self.running:
                 job.cancel()
+
+
+def slurm_jobs() -> set[str] | None:
+    """:return: ids of the jobs that Slurm has running or waiting, None if it does not answer"""
+    answer = subprocess.run(["squeue", "--noheader", "--array", "--format=%i"], capture_output=True, text=True)
+    return set(answer.stdout.split()) if answer.returncode == 0 else None
 
 
 def reason(error: Exception) -> str:

@@ -1,9 +1,9 @@
 """
 The published table: what was run for it (``protocol.yml``), and what the paper prints (``paper.yml``).
 
-A line of the protocol is a cell: ``environment``, ``algorithm`` (of an ablation also its ``variant``), ``steps``, ``seeds`` with
-the commit of each, ``eval_freq`` where it was not a thirtieth of the steps, and ``deviations``, the settings of its runs that are
-not those of the YAML files today.
+A line of the protocol is a cell: ``environment``, ``algorithm`` (of an ablation also its ``variant``), ``steps``, ``seeds``
+with the commit of each, ``eval_freq`` where it was not a thirtieth of the steps, and ``deviations``, the settings of its runs
+that are not those of the YAML files today.
 """
 
 from collections.abc import Callable

@@ -53,7 +53,7 @@ def read_rows(path: Path) -> list[Row]:
     remedy = f"delete it and {path.with_suffix('.json').name} beside it, and the run is trained anew"
     if not lines or tuple(lines[0]) != FIELDS:
         raise ResultsError(f"{path} does not start with the line {','.join(FIELDS)}: {remedy}")
-    rows = []
+    rows: list[Row] = []
     for number, line in enumerate(lines[1:], start=2):
         try:
             row = dict(zip(FIELDS, map(float, line), strict=True))

@@ -110,7 +110,9 @@ class Run:
             return
         before = read_meta(path)
         changed = differences(before["settings"], settings)
-        changed += differences(*({key: of.get(key) for key in ("eval_freq", "eval_episodes")} for of in (before, asdict(self))))
+        changed += differences(
+            *({key: of.get(key) for key in ("eval_freq", "eval_episodes")} for of in (before, asdict(self)))
+        )
         if changed:
             raise ResultsError(
                 f"{self.folder} was started with other settings ({', '.join(changed)}): go on with the former ones, take"

@@ -6,7 +6,7 @@ succeeds, else of the return.
 """
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -58,7 +58,7 @@ def iqm(scores: Sequence[float] | np.ndarray) -> Estimate:
     return _iqm(tuple(map(tuple, array.reshape(len(array), -1))))
 
 
-@lru_cache(maxsize=None)  # tables and figures show the same
+@cache  # tables and figures show the same
 def _iqm(scores: tuple[tuple[float, ...], ...]) -> Estimate:
     return estimate(np.array(scores), metrics.aggregate_iqm)
 
@@ -82,6 +82,11 @@ def matrix_of(scores: pd.DataFrame, row: str) -> np.ndarray | None:
     """:return: (seeds, environments) success rates of an algorithm, None unless every environment has as many seeds"""
     envs = list(dict.fromkeys(scores["env"]))
     columns = [cell_of(scores, row, env)["score"].to_numpy() for env in envs]
-    if len(envs) < 2 or "return" in set(scores["metric"]) or len({len(column) for column in columns}) > 1 or not len(columns[0]):
+    if (
+        len(envs) < 2
+        or "return" in set(scores["metric"])
+        or len({len(column) for column in columns}) > 1
+        or not len(columns[0])
+    ):
         return None
     return np.stack(columns, axis=1)

@@ -1,6 +1,6 @@
 """Tables in Markdown, of any number of algorithms and environments."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 import pandas as pd
@@ -14,23 +14,25 @@ Column = Callable[[str, str], str]
 
 def order(names: pd.Series, first: list[str]) -> list[str]:
     """:return: the distinct names, those of a list first and in its order"""
-    found = list(dict.fromkeys(names))
-    return [name for name in first if name in found] + [name for name in found if name not in first]
+    found = set(names)
+    return list(dict.fromkeys([*(name for name in first if name in found), *names]))
+
+
+def numbers(values: Iterable[float]) -> list[str]:
+    """:return: numbers with as many digits as the largest needs: one behind the point, three if all are below 2"""
+    values = list(values)
+    digits = 1 if max(map(abs, values)) >= 2 or not any(values) else 3
+    return [f"{value:.{digits}f}" for value in values]
 
 
 def mean_and_std(values: np.ndarray) -> str:
     """:return: mean and sample standard deviation"""
-    return f"{number(values.mean())}" + (f" ± {number(values.std(ddof=1))}" if len(values) > 1 else "")
-
-
-def number(value: float) -> str:
-    """:return: a score with one digit behind the point, small ones with three digits"""
-    return f"{value:.1f}" if abs(value) >= 10 or value == 0 else f"{value:.3g}"
+    return " ± ".join(numbers([values.mean(), values.std(ddof=1)] if len(values) > 1 else values))
 
 
 def interval(values: Estimate) -> str:
     """:return: an estimate and its interval"""
-    point, low, high = map(number, values)
+    point, low, high = numbers(values)
     return f"{point} [{low}, {high}]"
 
 
@@ -57,7 +59,7 @@ def score_table(scores: pd.DataFrame, rows: list[str], envs: list[str], columns:
                 continue
             values = cell["score"].to_numpy()
             lines.append(
-                [env, display_name(row), cell["metric"].iloc[0], mean_and_std(values), ", ".join(map(number, values))]
+                [env, display_name(row), cell["metric"].iloc[0], mean_and_std(values), ", ".join(numbers(values))]
                 + [interval(iqm(values)) if len(values) > 1 else ""]
                 + [column(row, env) for column in columns.values()]
                 + [mean_and_std(cell["return"].to_numpy()), f"{cell['timesteps'].max():,.0f}"]
