@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pandas as pd
 import yaml
-from ablations import TABLES, paper_column
+from ablations import TABLES, VARIANTS, paper_column
 
 from sb3_chdp.benchmark import figures, paper, tables
 from sb3_chdp.benchmark.paper import MAIN
@@ -63,7 +63,7 @@ def main() -> None:
     parts = [tables.report(scores, rows, envs, columns)]
     for table, title in TABLES.items():
         ablation = scores_of(read_results(RESULTS / table))
-        variants = tables.order(ablation["row"], ["full"])
+        variants = tables.order(ablation["row"], list(VARIANTS))
         columns = {"paper": paper_column, "settings": paper.deviation_column(protocol[table])}
         parts += [f"### {title}", tables.score_table(ablation, variants, tables.order(ablation["env"], []), columns)]
     text = "\n\n".join(parts)

@@ -31,7 +31,8 @@ SCRIPTS = {
 # Scripts for which one algorithm is named by --algo
 WITH_ALGO = ("train", "optimize", "enjoy", "record", "record_training", "plot")
 # What rl_zoo3 2.9.2 imports, declared by it or not
-REQUIRED = ("rl_zoo3", "requests", "pandas", "tensorboard", "submitit", "filelock")
+REQUIRED = ("rl_zoo3", "requests", "pandas", "tensorboard")
+BENCHMARK_REQUIRED = (*REQUIRED, "rliable", "submitit", "filelock")
 
 
 def _option(arguments: list[str], *names: str) -> str | None:
@@ -70,7 +71,8 @@ def main() -> None:
     command, arguments = sys.argv[1], sys.argv[2:]
     if command not in (*SCRIPTS, "benchmark"):
         sys.exit(f"sb3-chdp: unknown command {command!r}, choose from {', '.join(SCRIPTS)}, benchmark")
-    missing = [name for name in REQUIRED if importlib.util.find_spec(name) is None]
+    required = BENCHMARK_REQUIRED if command == "benchmark" else REQUIRED
+    missing = [name for name in required if importlib.util.find_spec(name) is None]
     if missing:
         sys.exit(f"sb3-chdp {command} needs {', '.join(missing)}: pip install 'sb3-chdp[zoo]'")
     # As python -m does: --gym-packages finds modules of the folder in which the user is

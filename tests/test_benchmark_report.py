@@ -157,7 +157,9 @@ def test_paper_command_trains_every_published_run():
     from sb3_chdp.benchmark.cli import make_runs, parse
 
     runs = make_runs(parse(["paper"])[0])
-    published = {(cell["algorithm"], cell["environment"], seed) for cell in paper.load_protocol()["main"] for seed in cell["seeds"]}
+    published = {
+        (cell["algorithm"], cell["environment"], seed) for cell in paper.load_protocol()["main"] for seed in cell["seeds"]
+    }
     assert {(run.algo, run.env_id, run.seed) for run in runs} == published and len(runs) == len(published)
     assert {run.eval_episodes for run in runs} == {100}
     (one,) = make_runs(parse(["paper", "--algos", "hppo", "--envs", "Goal-v0", "--seeds", "10", "--steps", "50"])[0])

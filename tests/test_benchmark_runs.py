@@ -19,7 +19,7 @@ from sb3_chdp.benchmark import jobs
 from sb3_chdp.benchmark.manager import RunManager, settings_of
 from sb3_chdp.benchmark.results import FIELDS, ResultsError, append_row, read_results, read_rows, write_rows
 from sb3_chdp.benchmark.runs import Run
-from sb3_chdp.benchmark.training import forget, train
+from sb3_chdp.benchmark.training import checkpoint_of, forget, train
 
 ENV_ID = "HardMove4-v0"
 ROOT = Path(__file__).parent.parent
@@ -33,7 +33,7 @@ TINY = {
 
 
 def make_run(folder, algo="hppo", n_timesteps=240, **kwargs):
-    settings = dict(eval_episodes=2, checkpoint_interval=-1.0, overrides={"n_timesteps": n_timesteps, **TINY[algo]})
+    settings = dict(eval_episodes=2, checkpoint_interval=0.3, overrides={"n_timesteps": n_timesteps, **TINY[algo]})
     return Run(algo, algo, ENV_ID, 3, str(folder), **{**settings, **kwargs})
 
 
@@ -44,7 +44,7 @@ def started(run):
     return subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.DEVNULL)
 
 
-def wait_for(condition, seconds=120):
+def wait_for(condition, seconds=600):
     for _ in range(int(seconds * 20)):
         if condition():
             return
@@ -56,12 +56,14 @@ def wait_for(condition, seconds=120):
 def test_a_killed_run_goes_on(algo, tmp_path):
     run = make_run(tmp_path, algo, n_timesteps=2400)
     process = started(run)
-    wait_for(lambda: list(run.folder.glob("checkpoint_*")) and len(run.rows()) > 3)
-    with pytest.raises(ResultsError, match=f"being trained by process {process.pid}"):
-        train(run)
-    process.kill()
-    process.wait()
-    (checkpoint,) = run.folder.glob("checkpoint_*")
+    try:
+        wait_for(lambda: list(run.folder.glob("checkpoint_*")) and len(run.rows()) > 3)
+        with pytest.raises(ResultsError, match=f"being trained by process {process.pid}"):
+            train(run)
+    finally:
+        process.kill()
+        process.wait()
+    checkpoint = checkpoint_of(run)
     before = read_rows(checkpoint / "rows.csv")
     train(run)
     rows = run.rows()
@@ -151,7 +153,19 @@ def test_damaged_results_name_the_file_and_the_remedy(damage, tmp_path):
 
 def benchmark(folder, *options):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "sb3_chdp", "benchmark", "--envs", ENV_ID, "--out", "out", "--eval-episodes", "2", *options]
+    command = [
+        sys.executable,
+        "-m",
+        "sb3_chdp",
+        "benchmark",
+        "--envs",
+        ENV_ID,
+        "--out",
+        "out",
+        "--eval-episodes",
+        "2",
+        *options,
+    ]
     return subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 

@@ -106,11 +106,13 @@ def test_every_algorithm(algo, tmp_path):
 def test_two_processes_tune_one_study(tmp_path):
     """What several machines do, with the journal on a file system that they share."""
     study = ["--storage", "study.log", "--study-name", "both", "--no-optim-plots", "--n-evaluations", "1"]
-    command = [sys.executable, "-m", "sb3_chdp", "optimize", "--algo", "hppo", "--env", ENV_ID, "-n", "60", "--eval-episodes", "1",
-               "--n-trials", "2", *study]  # fmt: skip
+    command = [sys.executable, "-m", "sb3_chdp", "optimize", "--algo", "hppo", "--env", ENV_ID, "-n", "60", "--n-trials", "2",
+               "--eval-episodes", "1", *study]  # fmt: skip
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     processes = [
-        subprocess.Popen([*command, "-f", f"tuned{i}", "--seed", str(i)], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
+        subprocess.Popen(
+            [*command, "-f", f"tuned{i}", "--seed", str(i)], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL
+        )
         for i in range(2)
     ]
     assert [process.wait(timeout=300) for process in processes] == [0, 0]

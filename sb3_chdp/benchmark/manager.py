@@ -8,20 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chdp.benchmark.runs import STOCK, Run
 from sb3_chdp.registry import ALGORITHMS
-from sb3_chdp.zoo import register
+from sb3_chdp.zoo import HybridExperimentManager, register
 
 FLATTEN = "sb3_chdp.wrappers.FlattenHybridAction"
 # Evaluation environments: they fill a batch of the policy
 N_EVAL_ENVS = 8
 
 
-class RunManager(ExperimentManager):
+class RunManager(HybridExperimentManager):
     """
     :param run: the run
     :param trained_agent: model of a checkpoint that :meth:`save_to` left, "" for a new one
@@ -78,11 +76,6 @@ class RunManager(ExperimentManager):
         defaults = yaml.safe_load(next(iter(ALGORITHMS.values())).hyperparams.read_text())["default"]
         if "normalize" in defaults:
             settings.setdefault("normalize", defaults["normalize"])
-
-    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
-        # Monitor insists on every keyword, and success is read from the infos where there is one
-        self.monitor_kwargs = {key: value for key, value in self.monitor_kwargs.items() if key != "info_keywords"}
-        return super().create_envs(n_envs, eval_env, no_log)
 
     def save_to(self, folder: Path, model: BaseAlgorithm) -> None:
         """
