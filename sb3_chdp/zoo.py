@@ -18,7 +18,7 @@ def register() -> None:
         if tuning is not None:
             HYPERPARAMS_SAMPLER[name], HYPERPARAMS_CONVERTER[name] = tuning
     # Where rl_zoo3.train takes it from
-    rl_zoo3.exp_manager.ExperimentManager = HybridExperimentManager
+    rl_zoo3.exp_manager.ExperimentManager = HybridExperimentManager  # type: ignore[misc]
 
 
 class HybridExperimentManager(ExperimentManager):

@@ -224,5 +224,6 @@ def test_bad_arguments(options, message, capsys):
 
 def test_reason_of_a_failure():
     assert "killed" in jobs.reason(jobs.submitit.core.utils.UncompletedJobError("no output"))
-    trace = "Job failed with trace:\n----------------------\nTraceback\n  File\nValueError: too big\n\n----------------------\nlogs"
+    ruler = "----------------------"
+    trace = f"Job failed with trace:\n{ruler}\nTraceback\n  File\nValueError: too big\n\n{ruler}\nlogs"
     assert jobs.reason(jobs.submitit.core.utils.FailedJobError(trace)) == "ValueError: too big"

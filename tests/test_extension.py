@@ -1,4 +1,4 @@
-"""An algorithm is a folder and one line, an environment a file and one registration: what docs/guide says, done word for word."""
+"""An algorithm is a folder and one line, an environment a file and one registration: docs/guide, word for word."""
 
 import os
 import re

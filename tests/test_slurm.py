@@ -41,8 +41,8 @@ def wait_for(condition, seconds):
 def test_a_preempted_job_goes_on_and_a_cancelled_one_is_reported(tmp_path):
     command = [
         sys.executable, "-m", "sb3_chdp", "benchmark", "--envs", ENV_ID, "--algos", "hppo", "--seeds", "0", "1",
-        "--steps", "60000", "--out", "out", "--eval-episodes", "2", "--checkpoint-interval", "1", "-params", "n_envs:4", "n_steps:50",
-        "--jobs", "1", "--cluster", "slurm", "--slurm-time", "30",
+        "--steps", "60000", "--out", "out", "--eval-episodes", "2", "--checkpoint-interval", "1",
+        "-params", "n_envs:4", "n_steps:50", "--jobs", "1", "--cluster", "slurm", "--slurm-time", "30",
     ]  # fmt: skip
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
