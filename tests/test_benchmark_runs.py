@@ -16,10 +16,11 @@ pytest.importorskip("rl_zoo3")
 pytest.importorskip("submitit")
 
 from sb3_chdp.benchmark import jobs
+from sb3_chdp.benchmark.checkpoint import checkpoint_of
 from sb3_chdp.benchmark.manager import RunManager, settings_of
 from sb3_chdp.benchmark.results import FIELDS, ResultsError, append_row, read_results, read_rows, write_rows
 from sb3_chdp.benchmark.runs import Run
-from sb3_chdp.benchmark.training import checkpoint_of, forget, train
+from sb3_chdp.benchmark.training import forget, train
 
 ENV_ID = "HardMove4-v0"
 ROOT = Path(__file__).parent.parent
