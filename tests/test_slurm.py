@@ -41,21 +41,21 @@ def wait_for(condition, seconds):
 def test_a_preempted_job_goes_on_and_a_cancelled_one_is_reported(tmp_path):
     command = [
         sys.executable, "-m", "sb3_chdp", "benchmark", "--envs", ENV_ID, "--algos", "hppo", "--seeds", "0", "1",
-        "--steps", "60000", "--out", "out", "--eval-episodes", "2", "--checkpoint-interval", "1",
-        "-params", "n_envs:4", "n_steps:50", "--jobs", "1", "--cluster", "slurm", "--slurm-time", "30",
+        "--steps", "40000", "--out", "out", "--eval-episodes", "2", "--checkpoint-interval", "1",
+        "-params", "n_envs:4", "n_steps:50", "n_epochs:1", "--jobs", "1", "--cluster", "slurm", "--slurm-time", "30",
     ]  # fmt: skip
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
         command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     folder = tmp_path / "out" / "hppo" / ENV_ID
-    wait_for(lambda: list(folder.glob("seed_0/checkpoint_*")), 240)
+    wait_for(lambda: list(folder.glob("seed_0/checkpoint_*")), 600)
     (first,) = running_jobs()
     slurm("scancel", "--signal=USR2", first)
     # The job that preempts it has ended; what is queued again waits for two minutes
-    wait_for(lambda: [job for job in running_jobs() if job != first], 240)
+    wait_for(lambda: [job for job in running_jobs() if job != first], 600)
     (second,) = running_jobs()
-    wait_for(lambda: (folder / "seed_1" / "started.json").exists(), 240)
+    wait_for(lambda: (folder / "seed_1" / "started.json").exists(), 600)
     slurm("scancel", second)
     output, _ = process.communicate(timeout=600)
     assert process.returncode == 1, output

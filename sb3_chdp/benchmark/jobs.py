@@ -140,7 +140,7 @@ def slurm_jobs() -> set[str] | None:
 
 def reason(error: Exception) -> str:
     """:return: a line that says why a job failed"""
-    if isinstance(error, submitit.core.utils.UncompletedJobError):
+    if not isinstance(error, submitit.core.utils.FailedJobError):
         return "its process was killed, perhaps for want of memory"
     # The exception at the end of the traceback that submitit quotes
     quoted = str(error).split("----------------------")
