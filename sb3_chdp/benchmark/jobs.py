@@ -140,7 +140,8 @@ def slurm_jobs() -> set[str] | None:
 
 def reason(error: Exception) -> str:
     """:return: a line that says why a job failed"""
-    if not isinstance(error, submitit.core.utils.FailedJobError):
+    errors = submitit.core.utils
+    if isinstance(error, errors.UncompletedJobError) and not isinstance(error, errors.FailedJobError):
         return "its process was killed, perhaps for want of memory"
     # The exception at the end of the traceback that submitit quotes
     quoted = str(error).split("----------------------")
