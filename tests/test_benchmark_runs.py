@@ -182,7 +182,7 @@ def test_a_killed_worker_is_reported_and_the_others_go_on(tmp_path):
     process = benchmark(tmp_path, *options)
     runs = [Run("hppo", "hppo", ENV_ID, seed, str(tmp_path / "out")) for seed in (0, 1)]
     os.kill(holder(runs[0]), signal.SIGKILL)
-    output, _ = process.communicate(timeout=300)
+    output, _ = process.communicate(timeout=900)
     assert process.returncode == 1, output
     assert "seed_0: its process was killed" in output
     assert [run.is_complete for run in runs] == [False, True]
