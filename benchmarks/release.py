@@ -1,7 +1,7 @@
 """
-The published models, from the runs that reproduce.py has left on this machine.
+The published models, from the runs that ``sb3-chdp benchmark paper`` has left.
 
-    python benchmarks/release.py                      for every environment CHDP's best seed, and HyAR-TD3 on Hard Move 6
+    python benchmarks/release.py --results logs/paper     for every environment CHDP's best seed, and HyAR-TD3 on Hard Move 6
     sb3-chdp enjoy --env Goal-v0 -f benchmarks/models      watch one
 
 A published model is a full zip of its algorithm, made small: the online networks of CHDP are replaced by their targets, by
@@ -13,13 +13,14 @@ import zipfile
 from pathlib import Path
 
 import torch as th
-from cells import ALGORITHMS, RESULTS, ROOT
 from stable_baselines3.common.base_class import BaseAlgorithm
-from tables import read_runs, scores_of
 
-from sb3_chdp import CHDP
+from sb3_chdp import ALGORITHMS, CHDP
+from sb3_chdp.benchmark.results import read_results
+from sb3_chdp.benchmark.statistics import cell_of, scores_of
 from sb3_chdp.envs import ENV_IDS
 
+ROOT = Path(__file__).parent
 PUBLISHED = [("chdp", env_id) for env_id in ENV_IDS] + [("hyar_td3", "HardMove6-v0")]
 
 
@@ -49,20 +50,20 @@ def save_compressed(model: BaseAlgorithm, path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--results", type=Path, default=RESULTS / "main")
+    parser.add_argument("--results", type=Path, default=Path("logs/paper"))
     args = parser.parse_args()
-    scores = scores_of(read_runs(args.results))
+    scores = scores_of(read_results(args.results))
     for algo, env_id in PUBLISHED:
-        runs = scores[(scores["row"] == algo) & (scores["env"] == env_id)]
-        zips = [args.results / algo / env_id / f"seed_{seed}.zip" for seed in runs.sort_values("success")["seed"]]
-        if not zips or not zips[-1].exists():
+        runs = cell_of(scores, algo, env_id).sort_values("score")
+        folders = [args.results / algo / env_id / f"seed_{seed}" / algo / f"{env_id}_1" for seed in runs["seed"]]
+        if not folders or not (folders[-1] / f"{env_id}.zip").exists():
             print(f"{algo} {env_id}: no trained model in {args.results}")
             continue
-        model = ALGORITHMS[algo].load(zips[-1], device="cpu")
+        model = ALGORITHMS[algo].load_class().load(folders[-1] / f"{env_id}.zip", device="cpu")
         shrink(model)
         path = ROOT / "models" / algo / f"{env_id}_1" / f"{env_id}.zip"
         save_compressed(model, path)
-        print(f"{algo} {env_id}: {zips[-1].stem}, {path.stat().st_size / 1e6:.2f} MB")
+        print(f"{algo} {env_id}: seed {runs['seed'].iloc[-1]}, {path.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

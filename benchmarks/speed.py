@@ -9,7 +9,6 @@ vCPUs, Python 3.11.7): read those ratios as orders of magnitude.
 """
 
 import argparse
-import platform
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -19,18 +18,19 @@ import gymnasium as gym
 import numpy as np
 import stable_baselines3 as sb3
 import torch as th
-from cells import ALGORITHMS, processor
 from dql_style import DQLStyleCHDP
 from gymnasium import spaces
+from publish import README, replace_section
 from stable_baselines3 import TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
-from tables import README, replace_section
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from torch import nn
 from torch.profiler import ProfilerActivity, profile
 
 import sb3_chdp
-from sb3_chdp import CHDP, FlattenHybridAction, HybridActionSpec
+from sb3_chdp import ALGORITHMS, CHDP, HPPO, PDQNTD3, FlattenHybridAction, HybridActionSpec
+from sb3_chdp.benchmark.training import machine
 
 ENV_ID = "HardMove6-v0"
 # Of the originals with a uniformly random policy: frames per second for Platform (with numba) and Goal, else steps
@@ -73,6 +73,12 @@ def medians(functions: list[Callable[[], object]], repeats: int) -> list[float]:
             function()
             values.append(time.perf_counter() - start)
     return [statistics.median(values) for values in durations]
+
+
+def off_policy() -> dict[str, type[OffPolicyAlgorithm]]:
+    """:return: the off-policy algorithms by their display names"""
+    classes = {algorithm.display_name: algorithm.load_class() for algorithm in ALGORITHMS.values()}
+    return {name: algorithm for name, algorithm in classes.items() if issubclass(algorithm, OffPolicyAlgorithm)}
 
 
 def build(algorithm: type[BaseAlgorithm], env: Any = ENV_ID, n_envs: int = 8, wrapper: Any = None, **kwargs: Any) -> Any:
@@ -196,17 +202,14 @@ def baselines(repeats: int) -> Iterator[str]:
     rows: list[tuple[str, Callable[[], object], int]] = []
     settings = dict(policy_kwargs=dict(net_arch=[256, 256]))
     rows.append(("SB3's TD3", build(TD3, wrapper=FlattenHybridAction, **settings), 2))
-    for name in ("pa_td3", "pdqn_td3", "hhqn_td3", "hyar_td3"):
-        rows.append((ALGORITHMS[name].__name__, build(ALGORITHMS[name], **settings), 2))
-    rows.append(("PDQNTD3, multi_pass", build(ALGORITHMS["pdqn_td3"], multi_pass=True, **settings), 2))
+    rows += [(name, build(algorithm, **settings), 2) for name, algorithm in off_policy().items() if algorithm is not CHDP]
+    rows.append(("PDQN-TD3, multi_pass", build(PDQNTD3, multi_pass=True, **settings), 2))
     rows.append(("CHDP", build(CHDP), 1))
     rows.append(("CHDP, N = 5", build(CHDP, n_diffusion_steps=5), 1))
     seconds = medians([lambda m=model, n=n: m.train(n, 128) for _, model, n in rows], repeats)  # type: ignore[attr-defined]
     per_step = [value / n for value, (_, _, n) in zip(seconds, rows, strict=True)]
     env = make_vec_env(ENV_ID, 8, seed=0)
-    hppo = ALGORITHMS["hppo"](
-        "MlpPolicy", env, n_steps=128, n_epochs=1, seed=0, device="cpu", policy_kwargs=settings["policy_kwargs"]
-    )
+    hppo = HPPO("MlpPolicy", env, n_steps=128, n_epochs=1, seed=0, device="cpu", policy_kwargs=settings["policy_kwargs"])
     hppo.learn(1024)
     (rollout,) = medians([hppo.train], repeats // 3)  # 16 minibatches
     per_step.append(rollout / 16)
@@ -254,14 +257,12 @@ def memory(repeats: int) -> Iterator[str]:
     """(h) replay buffers of 1e6 transitions: bytes of their arrays, which are allocated at once"""
     yield "| environment | algorithm | row | replay buffer, MB |\n|---|---|---|---|"
     for env_id in ("Platform-v0", "HardMove10-v0"):
-        for name, algorithm in ALGORITHMS.items():
-            if name == "hppo":
-                continue
+        for name, algorithm in off_policy().items():
             model = algorithm("MlpPolicy", env_id, buffer_size=10, device="cpu")
             buffer = model.replay_buffer
             arrays = [value for value in vars(buffer).values() if isinstance(value, np.ndarray)]
             size = sum(array.nbytes for array in arrays) / buffer.buffer_size
-            yield f"| {env_id} | {algorithm.__name__} | {buffer.actions.shape[-1]} | {size:,.0f} |"
+            yield f"| {env_id} | {name} | {buffer.actions.shape[-1]} | {size:,.0f} |"
 
 
 TABLES = {
@@ -278,7 +279,7 @@ def main() -> None:
     th.set_num_threads(1)
     text = (
         f"sb3_chdp {sb3_chdp.__version__}, stable_baselines3 {sb3.__version__}, torch {th.__version__}, "
-        f"Python {platform.python_version()}, {processor()}, 1 thread\n"
+        f"{machine(threads=1)}\n"
     )
     print(text)
     for name in args.tables or TABLES:

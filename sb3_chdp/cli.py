@@ -7,17 +7,17 @@ The command ``sb3-chdp``: rl_zoo3's scripts with the algorithms and environments
     sb3-chdp record --env Platform-v0 -f logs    record a video of it
     sb3-chdp plot --env Platform-v0 -f logs -y success     learning curves
     sb3-chdp all_plots | plot_from_file | record_training   the other scripts of rl_zoo3
-    sb3-chdp benchmark main --jobs 2             reproduce the paper's tables (in a clone of the repository)
+    sb3-chdp benchmark --envs MyEnv-v0 --gym-packages my_package --algos chdp hppo sb3:sac    compare algorithms
+    sb3-chdp benchmark paper                     the published table once more
     sb3-chdp --version
 """
 
 import importlib.util
+import os
 import runpy
-import subprocess
 import sys
-from pathlib import Path
 
-from sb3_chdp import __version__
+from sb3_chdp import ALGORITHMS, __version__
 
 SCRIPTS = {
     "train": "rl_zoo3.train",
@@ -33,7 +33,7 @@ SCRIPTS = {
 WITH_ALGO = ("train", "optimize", "enjoy", "record", "record_training", "plot")
 # What rl_zoo3 2.9.2 imports, declared by it or not
 REQUIRED = ("rl_zoo3", "requests", "pandas", "tensorboard")
-BENCHMARK = Path(__file__).parent.parent / "benchmarks" / "reproduce.py"
+BENCHMARK_REQUIRED = (*REQUIRED, "rliable", "submitit", "filelock")
 
 
 def _option(arguments: list[str], *names: str) -> str | None:
@@ -51,31 +51,20 @@ def prepare_arguments(command: str, arguments: list[str]) -> list[str]:
     :param arguments: what the user wrote behind it
     :return: the arguments for rl_zoo3's script
     """
-    from sb3_chdp.zoo import HYPERPARAMS_FOLDER
-
     arguments = list(arguments)
     if command in ("plot", "all_plots"):
         # The scripts that read folders do not know how rl_zoo3 names that of an id with a slash
         arguments = [argument.replace("sb3_chdp/", "sb3_chdp-") for argument in arguments]
     short_name = ("-a",) if command == "plot" else ()
     if command in WITH_ALGO and _option(arguments, "--algo", *short_name) is None:
-        arguments = ["--algo", "chdp", *arguments]
+        arguments = ["--algo", next(iter(ALGORITHMS)), *arguments]
     if command == "optimize" and not {"-optimize", "--optimize-hyperparameters"} & set(arguments):
         arguments.append("--optimize-hyperparameters")
-    if command in ("train", "optimize"):
-        config = HYPERPARAMS_FOLDER / f"{_option(arguments, '--algo')}.yml"
+    algorithm = ALGORITHMS.get(_option(arguments, "--algo") or "")
+    if command in ("train", "optimize") and algorithm is not None:
         # In front, so that a -conf of the user wins; rl_zoo3 has the files of its own algorithms
-        if config.is_file():
-            arguments = ["-conf", str(config), *arguments]
+        arguments = ["-conf", str(algorithm.hyperparams), *arguments]
     return arguments
-
-
-def run_benchmark(arguments: list[str]) -> None:
-    """Run ``benchmarks/reproduce.py``, which is not part of the package."""
-    if not BENCHMARK.is_file():
-        sys.exit("sb3-chdp benchmark works in a clone of the repository: it writes to its folder benchmarks")
-    # As a script, so that its worker processes find it
-    sys.exit(subprocess.run([sys.executable, str(BENCHMARK), *arguments]).returncode)
 
 
 def main() -> None:
@@ -89,12 +78,17 @@ def main() -> None:
     command, arguments = sys.argv[1], sys.argv[2:]
     if command not in (*SCRIPTS, "benchmark"):
         sys.exit(f"sb3-chdp: unknown command {command!r}, choose from {', '.join(SCRIPTS)}, benchmark")
-    if command == "benchmark":
-        run_benchmark(arguments)
-        return
-    missing = [name for name in REQUIRED if importlib.util.find_spec(name) is None]
+    required = BENCHMARK_REQUIRED if command == "benchmark" else REQUIRED
+    missing = [name for name in required if importlib.util.find_spec(name) is None]
     if missing:
         sys.exit(f"sb3-chdp {command} needs {', '.join(missing)}: pip install 'sb3-chdp[zoo]'")
+    # As python -m does: --gym-packages finds modules of the folder in which the user is
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    if command == "benchmark":
+        from sb3_chdp.benchmark.cli import main as benchmark
+
+        sys.exit(benchmark(arguments))
 
     from sb3_chdp.zoo import register
 

@@ -1,37 +1,40 @@
 """Registration with rl_zoo3. Importing this module imports rl_zoo3, which patches Gymnasium."""
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
-from rl_zoo3.hyperparams_opt import (
-    HYPERPARAMS_CONVERTER,
-    HYPERPARAMS_SAMPLER,
-    convert_onpolicy_params,
-    sample_ppo_params,
-)
+import gymnasium as gym
+import rl_zoo3.exp_manager
+from rl_zoo3.exp_manager import ExperimentManager
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
+from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3, PDQNTD3, HyARTD3, samplers
-
-HYPERPARAMS_FOLDER = Path(__file__).parent / "hyperparams"
-
-
-TD3_CONVERTER = samplers.convert_hybrid_td3_params
-# Name for --algo: class, Optuna sampler, converter of its trials
-ZOO: dict[str, tuple[type, Callable[..., dict[str, Any]], Callable[..., dict[str, Any]]]] = {
-    "chdp": (CHDP, samplers.sample_chdp_params, samplers.convert_chdp_params),
-    "hppo": (HPPO, sample_ppo_params, convert_onpolicy_params),
-    "pa_td3": (PATD3, samplers.sample_hybrid_td3_params, TD3_CONVERTER),
-    "pdqn_td3": (PDQNTD3, samplers.sample_pdqn_td3_params, TD3_CONVERTER),
-    "hhqn_td3": (HHQNTD3, samplers.sample_hybrid_td3_params, TD3_CONVERTER),
-    "hyar_td3": (HyARTD3, samplers.sample_hyar_td3_params, TD3_CONVERTER),
-}
+from sb3_chdp.registry import ALGORITHMS
 
 
 def register() -> None:
     """Make the algorithms of this package known to every script of rl_zoo3, in this process."""
-    for name, (algorithm, sampler, converter) in ZOO.items():
-        ALGOS[name] = algorithm
-        HYPERPARAMS_SAMPLER[name] = sampler
-        HYPERPARAMS_CONVERTER[name] = converter
+    for name, algorithm in ALGORITHMS.items():
+        ALGOS[name] = algorithm.load_class()
+        tuning = algorithm.load_tuning()
+        if tuning is not None:
+            HYPERPARAMS_SAMPLER[name], HYPERPARAMS_CONVERTER[name] = tuning
+    # Where rl_zoo3.train takes it from
+    rl_zoo3.exp_manager.ExperimentManager = HybridExperimentManager  # type: ignore[misc]
+
+
+class HybridExperimentManager(ExperimentManager):
+    """rl_zoo3's manager; the monitor notes only what the environment has in its infos, which need not be success."""
+
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+        wanted = self.monitor_kwargs.get("info_keywords", ())
+        if wanted:
+            present = self._info_keywords()
+            self.monitor_kwargs = {**self.monitor_kwargs, "info_keywords": tuple(key for key in wanted if key in present)}
+        return super().create_envs(n_envs, eval_env, no_log)
+
+    def _info_keywords(self) -> set[str]:
+        """:return: what the environment has in the info of a step"""
+        env = gym.make(self.env_name.gym_id, **self.env_kwargs)
+        env.reset(seed=0)
+        info = env.step(env.action_space.sample())[-1]
+        env.close()
+        return set(info)

@@ -1,19 +1,24 @@
 """The algorithms that the shared tests run on, with small settings."""
 
-from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3, PDQNTD3, HyARTD3
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_chdp import ALGORITHMS as REGISTRY
+from sb3_chdp import CHDP
 from tests.hybrid_envs import HybridIdentityEnv, layouts
 
 OFF_POLICY = dict(batch_size=8, learning_starts=12, buffer_size=500)
-SMALL = {
-    CHDP: dict(OFF_POLICY, n_diffusion_steps=2, n_action_candidates=2, latent_dim=3),
-    PATD3: OFF_POLICY,
-    HHQNTD3: OFF_POLICY,
-    PDQNTD3: OFF_POLICY,
-    HyARTD3: dict(OFF_POLICY, embedding_dim=3, parameter_latent_dim=2, representation_warmup_steps=3, representation_freq=8),
-    HPPO: dict(n_steps=10, batch_size=5, n_epochs=2),
+ON_POLICY = dict(n_steps=10, batch_size=5, n_epochs=2)
+# What an algorithm has beside these
+OWN = {
+    "chdp": dict(n_diffusion_steps=2, n_action_candidates=2, latent_dim=3),
+    "hyar_td3": dict(embedding_dim=3, parameter_latent_dim=2, representation_warmup_steps=3, representation_freq=8),
 }
+SMALL = {}
+for name, line in REGISTRY.items():
+    algorithm = line.load_class()
+    SMALL[algorithm] = {**(OFF_POLICY if issubclass(algorithm, OffPolicyAlgorithm) else ON_POLICY), **OWN.get(name, {})}
 ALGORITHMS = list(SMALL)
-OFF_POLICY_ALGORITHMS = [algorithm for algorithm in ALGORITHMS if algorithm is not HPPO]
+OFF_POLICY_ALGORITHMS = [algorithm for algorithm in ALGORITHMS if issubclass(algorithm, OffPolicyAlgorithm)]
 LAYOUTS = list(layouts())
 
 

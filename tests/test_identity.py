@@ -5,18 +5,20 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3, PDQNTD3, HyARTD3
+from sb3_chdp import CHDP, HPPO, HyARTD3
+from tests.algorithms import OFF_POLICY_ALGORITHMS
 from tests.hybrid_envs import HybridIdentityEnv
 
 # Uniformly random actions succeed in 9 % of the episodes; a policy that gets the action right and always
 # chooses 0 for its parameter in 30 %, one that gets the parameter right and guesses the action in 33 %
 THRESHOLD = 0.8
+BASELINES = [algorithm for algorithm in OFF_POLICY_ALGORITHMS if algorithm is not CHDP]
 SETTINGS = {
-    CHDP: dict(n_diffusion_steps=5, gradient_steps=2, learning_starts=200, policy_kwargs=dict(net_arch=[64, 64])),
     **{
-        td3: dict(gradient_steps=8, learning_rate=1e-3, learning_starts=200, policy_kwargs=dict(net_arch=[64, 64]))
-        for td3 in (PATD3, HHQNTD3, PDQNTD3)
+        baseline: dict(gradient_steps=8, learning_rate=1e-3, learning_starts=200, policy_kwargs=dict(net_arch=[64, 64]))
+        for baseline in OFF_POLICY_ALGORITHMS
     },
+    CHDP: dict(n_diffusion_steps=5, gradient_steps=2, learning_starts=200, policy_kwargs=dict(net_arch=[64, 64])),
     HyARTD3: dict(
         gradient_steps=8,
         learning_rate=1e-3,
@@ -63,7 +65,7 @@ def test_broken_chdp_fails(broken):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("baseline", [PATD3, PDQNTD3, HHQNTD3, HyARTD3], ids=lambda baseline: baseline.__name__)
+@pytest.mark.parametrize("baseline", BASELINES, ids=lambda baseline: baseline.__name__)
 def test_broken_baselines_fail(baseline):
     """A critic that does not learn leads nowhere."""
     env = make_vec_env(HybridIdentityEnv, 8, seed=0)

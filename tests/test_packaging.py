@@ -6,6 +6,8 @@ import sys
 import zipfile
 from pathlib import Path
 
+import pytest
+
 import sb3_chdp
 
 ROOT = Path(__file__).parent.parent
@@ -19,12 +21,17 @@ def test_wheel(tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         archive.extractall(tmp_path / "site")
-    assert {"sb3_chdp/py.typed", "sb3_chdp/version.txt", "sb3_chdp/hyperparams/chdp.yml"} <= set(names)
+    assert {
+        "sb3_chdp/py.typed",
+        "sb3_chdp/version.txt",
+        "sb3_chdp/hyperparams/chdp.yml",
+        "sb3_chdp/benchmark/protocol.yml",
+    } <= set(names)
     assert {name.split("/")[0].split("-")[0] for name in names} == {"sb3_chdp"}, "nothing else, no tests"
     # Used from the wheel: the version and the YAML files are found
     code = (
-        "import sb3_chdp, sb3_chdp.zoo as zoo;"
-        "print(sb3_chdp.__file__, sb3_chdp.__version__, (zoo.HYPERPARAMS_FOLDER / 'chdp.yml').is_file())"
+        "import sb3_chdp;"
+        "print(sb3_chdp.__file__, sb3_chdp.__version__, all(a.hyperparams.is_file() for a in sb3_chdp.ALGORITHMS.values()))"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path / "site", check=True, capture_output=True, text=True
@@ -42,6 +49,14 @@ def test_import_is_light():
     code = "import sys, sb3_chdp; print([m for m in ('rl_zoo3', 'pygame', 'optuna', 'matplotlib.pyplot') if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_classes_of_the_registry_are_exported():
+    for algorithm in sb3_chdp.ALGORITHMS.values():
+        assert getattr(sb3_chdp, algorithm.class_name) is algorithm.load_class()
+        assert algorithm.class_name in sb3_chdp.__all__ and algorithm.class_name in dir(sb3_chdp)
+    with pytest.raises(AttributeError, match="NoAlgorithm"):
+        _ = sb3_chdp.NoAlgorithm
 
 
 def test_example_of_the_readme():

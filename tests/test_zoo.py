@@ -8,15 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_chdp import ALGORITHMS
 from sb3_chdp.cli import SCRIPTS
 from sb3_chdp.envs import ENV_IDS
 
 pytest.importorskip("rl_zoo3")
+optuna = pytest.importorskip("optuna")
 
 ENV_ID = "HardMove4-v0"
 TINY = ["-params", "n_envs:2", "learning_starts:20", "n_diffusion_steps:2", "batch_size:8", "buffer_size:500"]
-HYPERPARAMS = Path(__file__).parent.parent / "hyperparams"
+DEFAULT = next(iter(ALGORITHMS))
 
 
 def run(*arguments, cwd, code=0):
@@ -44,7 +47,7 @@ def test_train(trained):
     assert (folder / f"{ENV_ID}.zip").is_file() and (folder / "best_model.zip").is_file()
     assert len(np.load(folder / "evaluations.npz")["successes"]) >= 2
     config = dict(yaml.load((folder / ENV_ID / "config.yml").read_text(), Loader=yaml.UnsafeLoader))
-    own = yaml.safe_load((HYPERPARAMS / "chdp.yml").read_text())[ENV_ID]
+    own = yaml.safe_load(ALGORITHMS[DEFAULT].hyperparams.read_text())[ENV_ID]
     assert config["gradient_steps"] == own["gradient_steps"] != 1, "the YAML file of the package was used"
 
 
@@ -83,22 +86,41 @@ def test_optimize_and_train_the_best_trial(trained):
     run("train", "--env", ENV_ID, "-n", "60", "--eval-freq", "-1", "--trial-id", "1", *study, cwd=trained)
 
 
-OFF_POLICY = ["learning_starts:20", "buffer_size:100"]
-BASELINES = {
-    "hppo": ["n_steps:5", "batch_size:10"],
-    "pa_td3": OFF_POLICY,
-    "pdqn_td3": OFF_POLICY,
-    "hhqn_td3": OFF_POLICY,
-    "hyar_td3": [*OFF_POLICY, "representation_warmup_steps:5"],
-}
+OWN = {"chdp": ["n_diffusion_steps:2"], "hyar_td3": ["representation_warmup_steps:5"]}
 
 
-@pytest.mark.parametrize("algo", BASELINES)
-def test_baselines(algo, tmp_path):
-    run("train", "--algo", algo, "--env", ENV_ID, "-n", "60", "-params", *BASELINES[algo], "--eval-freq", "-1", cwd=tmp_path)
+def small(algo):
+    """Settings with which an algorithm learns within 60 steps."""
+    off_policy = issubclass(ALGORITHMS[algo].load_class(), OffPolicyAlgorithm)
+    shared = ["learning_starts:20", "buffer_size:100"] if off_policy else ["n_steps:5", "batch_size:10"]
+    return [*shared, *OWN.get(algo, [])]
+
+
+@pytest.mark.parametrize("algo", [name for name in ALGORITHMS if name != DEFAULT])
+def test_every_algorithm(algo, tmp_path):
+    run("train", "--algo", algo, "--env", ENV_ID, "-n", "60", "-params", *small(algo), "--eval-freq", "-1", cwd=tmp_path)
     run("enjoy", "--algo", algo, "--env", ENV_ID, "-f", "logs", "--no-render", "-n", "40", cwd=tmp_path)
     run("optimize", "--algo", algo, "--env", ENV_ID, "-n", "40", "--n-trials", "1", "--n-evaluations", "1",
         "--eval-episodes", "1", "--no-optim-plots", "-f", "tuned", cwd=tmp_path)  # fmt: skip
+
+
+def test_two_processes_tune_one_study(tmp_path):
+    """What several machines do, with the journal on a file system that they share."""
+    study = ["--storage", "study.log", "--study-name", "both", "--no-optim-plots", "--n-evaluations", "1"]
+    command = [sys.executable, "-m", "sb3_chdp", "optimize", "--algo", "hppo", "--env", ENV_ID, "-n", "60", "--n-trials", "2",
+               "--eval-episodes", "1", *study]  # fmt: skip
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    processes = [
+        subprocess.Popen(
+            [*command, "-f", f"tuned{i}", "--seed", str(i)], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL
+        )
+        for i in range(2)
+    ]
+    assert [process.wait(timeout=300) for process in processes] == [0, 0]
+    storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(tmp_path / "study.log")))
+    trials = optuna.load_study(study_name="both", storage=storage).trials
+    assert [trial.number for trial in trials] == [0, 1, 2, 3]
+    assert all(trial.state.is_finished() for trial in trials)
 
 
 def test_users_own_hyperparameters_win(trained):
@@ -132,10 +154,11 @@ def test_without_the_zoo_extra(tmp_path):
     assert result.stderr.strip() == "sb3-chdp train needs rl_zoo3: pip install 'sb3-chdp[zoo]'"
 
 
-@pytest.mark.parametrize("path", sorted(HYPERPARAMS.glob("*.yml")), ids=lambda path: path.name)
-def test_yaml_files_have_all_environments(path):
-    settings = yaml.safe_load(path.read_text())
-    assert set(settings) == {"default", *ENV_IDS, *(f"sb3_chdp/{env_id}" for env_id in ENV_IDS)}
-    assert all(settings[env_id] == settings[f"sb3_chdp/{env_id}"] for env_id in ENV_IDS)
+@pytest.mark.parametrize("algorithm", ALGORITHMS.values(), ids=lambda algorithm: algorithm.name)
+def test_yaml_files_are_complete(algorithm):
+    settings = yaml.safe_load(algorithm.hyperparams.read_text())
+    assert "default" in settings
+    own = [env_id for env_id in ENV_IDS if env_id in settings]
+    assert all(settings[env_id] == settings[f"sb3_chdp/{env_id}"] for env_id in own)
     for env_settings in settings.values():
         assert {"n_timesteps", "policy"} <= set(env_settings)

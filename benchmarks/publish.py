@@ -1,0 +1,88 @@
+"""
+What the documents show of the published results: protocol, tables and figures from the files in ``results``.
+
+    python benchmarks/publish.py             protocol.yml, the tables in the two README files, figures
+    python benchmarks/publish.py --print     tables, printed only
+
+A run that is to be published comes into results/<table>/<algorithm or variant>/<environment>, CSV and JSON.
+"""
+
+import argparse
+from pathlib import Path
+
+import pandas as pd
+import yaml
+from ablations import TABLES, VARIANTS, paper_column
+
+from sb3_chdp.benchmark import figures, paper, tables
+from sb3_chdp.benchmark.paper import MAIN
+from sb3_chdp.benchmark.results import read_results
+from sb3_chdp.benchmark.runs import display_name
+from sb3_chdp.benchmark.statistics import cell_of, scores_of
+from sb3_chdp.registry import ALGORITHMS
+
+ROOT = Path(__file__).parent
+RESULTS = ROOT / "results"
+README = ROOT / "README.md"
+FIGURES = ROOT / "figures"
+PROTOCOL_HEADER = (
+    "# Written by benchmarks/publish.py from the files of the runs; what the keys mean: paper.py beside this file.\n"
+)
+
+
+def replace_section(path: Path, name: str, text: str) -> None:
+    """Replace what stands between the two markers of a section of a Markdown file."""
+    start, end = (f"<!-- {name}: {place} -->" for place in ("start", "end"))
+    before, rest = path.read_text().split(start)
+    path.write_text(f"{before}{start}\n{text}\n{end}{rest.split(end)[1]}")
+
+
+def overview(scores: pd.DataFrame, rows: list[str], envs: list[str]) -> str:
+    """:return: a line per algorithm, a column per environment: mean and standard deviation of the score, paper in brackets"""
+    lines = []
+    for row in rows:
+        entries = []
+        for env in envs:
+            cell, published = cell_of(scores, row, env), paper.paper_column(row, env)
+            entry = "" if cell.empty else tables.mean_and_std(cell["score"].to_numpy())
+            entries.append(f"{entry} [{published}]" if published else entry)
+        lines.append([display_name(row), *entries])
+    return tables.markdown(["algorithm", *envs], lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--print", action="store_true", dest="only_print")
+    args = parser.parse_args()
+    protocol = {table: paper.describe_cells(RESULTS, table) for table in (MAIN, *TABLES)}
+    results = read_results(RESULTS / MAIN)
+    scores = scores_of(results)
+    envs = tables.order(scores["env"], [cell["environment"] for cell in yaml_order(protocol[MAIN])])
+    rows = tables.order(scores["row"], list(ALGORITHMS))
+    columns = {"paper": paper.paper_column, "settings": paper.deviation_column(protocol[MAIN])}
+    parts = [tables.report(scores, rows, envs, columns)]
+    for table, title in TABLES.items():
+        ablation = scores_of(read_results(RESULTS / table))
+        variants = tables.order(ablation["row"], list(VARIANTS))
+        columns = {"paper": paper_column, "settings": paper.deviation_column(protocol[table])}
+        parts += [f"### {title}", tables.score_table(ablation, variants, tables.order(ablation["env"], []), columns)]
+    text = "\n\n".join(parts)
+    print(text)
+    if args.only_print:
+        return
+    paper.PROTOCOL.write_text(PROTOCOL_HEADER + yaml.safe_dump(protocol, sort_keys=False, width=127))
+    replace_section(README, "tables", text)
+    replace_section(ROOT.parent / "README.md", "tables", overview(scores, rows, envs))
+    for x, name in (("timesteps", "curves.png"), ("minutes", "curves_minutes.png")):
+        figures.plot_curves(results, scores, rows, envs, x, FIGURES / name)
+    figures.plot_scores(scores, rows, envs, FIGURES / "scores.png", paper.paper_mean)
+
+
+def yaml_order(cells: list[paper.Cell]) -> list[paper.Cell]:
+    """:return: cells in the order in which the paper lists their environments, others behind"""
+    order = list(yaml.safe_load(paper.PAPER.read_text()))
+    return sorted(cells, key=lambda cell: order.index(cell["environment"]) if cell["environment"] in order else len(order))
+
+
+if __name__ == "__main__":
+    main()
