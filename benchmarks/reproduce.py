@@ -3,8 +3,6 @@ The paper's tables, with our own numbers (also ``sb3-chdp benchmark``).
 
     python benchmarks/reproduce.py main --jobs 2                         6 algorithms x 8 environments x 3 seeds
     python benchmarks/reproduce.py main --algos chdp --envs HardMove6-v0 --seeds 10 11 12
-    python benchmarks/reproduce.py ablation --jobs 2                     5 variants of CHDP x 2 environments, paper's settings
-    python benchmarks/reproduce.py ablation_tuned --jobs 2               the same with the settings of the YAML file
     python benchmarks/reproduce.py expressivity                          actions of the published models: expressivity.py
 
 Every cell appends its evaluations to results/<table>/<row>/<environment>/seed_<k>.csv and leaves its settings, versions and
@@ -28,31 +26,6 @@ from rich.table import Table
 
 from sb3_chdp.envs import ENV_IDS
 
-# Of the ablation: the paper's default parameters, losses and critics, and no search beyond the policies' own draws, which may
-# cover up what they lack
-PAPER_DEFAULTS = {
-    "n_diffusion_steps": 15,
-    "eta": 10.0,
-    "latent_dim": 8,
-    "improvement_parameters": "stored",
-    "uniform_fraction": 0.0,
-    "n_random_candidates": 0,
-    "n_refinement_candidates": 0,
-    "critics_train_codebook": False,
-    "prioritized_replay": False,
-    "codebook_lr_factor": 0.1,
-    "n_target_candidates": 1,
-    "policy_kwargs": {"whitening": False, "layer_norm": False, "parameter_degree": 1, "bilinear": False},
-}
-# Row of both ablation tables: arguments of CHDP
-ABLATION = {
-    "full": {},
-    "without_diffusion": {"diffusion": False},
-    "without_codebook": {"codebook": False},
-    "without_sequential_update": {"sequential_update": False},
-    "without_both": {"codebook": False, "sequential_update": False},
-}
-ABLATION_ENVS = ("HardGoal-v0", "HardMove6-v0")
 # No setting was chosen by looking at these seeds: tuning uses seeds below 10
 SEEDS = (10, 11, 12)
 
@@ -70,15 +43,10 @@ def make_cells(args: argparse.Namespace) -> list[Cell]:
     )
     cells = []
     for seed in args.seeds:
-        if args.table == "main":
-            rows = [(algo, algo, overrides) for algo in args.algos]
-            envs = args.envs or ENV_IDS
-        else:
-            base = PAPER_DEFAULTS if args.table == "ablation" else {}
-            rows = [(name, "chdp", {**base, **ABLATION[name], **overrides}) for name in args.variants]
-            envs = args.envs or ABLATION_ENVS
         cells += [
-            Cell(name, algo, env_id, seed, overrides=settings, **common) for env_id in envs for name, algo, settings in rows
+            Cell(algo, algo, env_id, seed, overrides=overrides, **common)
+            for env_id in args.envs or ENV_IDS
+            for algo in args.algos
         ]
     return cells
 
@@ -106,9 +74,8 @@ def overview(cells: list[Cell], started: float) -> Table:
 
 def parse_args() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("table", choices=["main", "ablation", "ablation_tuned", "expressivity"])
+    parser.add_argument("table", choices=["main", "expressivity"])
     parser.add_argument("--algos", nargs="+", default=list(ALGORITHMS), choices=list(ALGORITHMS), help="of the main table")
-    parser.add_argument("--variants", nargs="+", default=list(ABLATION), choices=list(ABLATION), help="of the ablations")
     parser.add_argument("--envs", nargs="+", choices=ENV_IDS, metavar="ENV", help=", ".join(ENV_IDS))
     parser.add_argument("--seeds", nargs="+", type=int, default=list(SEEDS))
     parser.add_argument("--steps", type=int, help="environment steps (default: those of the YAML file)")

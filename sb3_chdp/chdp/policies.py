@@ -71,7 +71,7 @@ class CHDPPolicy(HybridPolicy):
 
     def __init__(
         self,
-        observation_space: spaces.Space,
+        observation_space: spaces.Space[Any],
         action_space: HybridBox,
         lr_schedule: Schedule,
         net_arch: list[int] | dict[str, list[int]] | None = None,
@@ -148,7 +148,7 @@ class CHDPPolicy(HybridPolicy):
             self.parameter_degree,
             self.bilinear,
         )
-        codebook = Codebook(spec.n_discrete_actions, latent_dim)
+        codebook = self._make_codebook(spec.n_discrete_actions, latent_dim)
         self.actor = CooperativeActor(
             self.observation_space,
             self.action_space,
@@ -177,6 +177,9 @@ class CHDPPolicy(HybridPolicy):
         for name, model in (("latent", self.actor.discrete_policy), ("parameter", self.actor.continuous_policy)):
             noise = th.randn((model.n_steps, FIXED_NOISE_CHAINS, model.dim), generator=generator)
             self.register_buffer(f"fixed_{name}_noise", noise, persistent=False)
+
+    def _make_codebook(self, n_discrete_actions: int, latent_dim: int) -> Codebook:
+        return Codebook(n_discrete_actions, latent_dim)
 
     def _make_model(self, dim: int, condition_dim: int, net_arch: list[int]) -> DiffusionModel:
         return DiffusionModel(dim, condition_dim, self.n_diffusion_steps, net_arch, self.activation_fn)
@@ -248,12 +251,12 @@ class CHDPPolicy(HybridPolicy):
             self.n_refinement_candidates if deterministic else 0,
             hashes,
         )
-        return th.cat([k[:, None].float(), parameters, latents], dim=1)
+        return self.action_space.columns.pack(discrete_actions=k.float(), parameters=parameters, latents=latents)
 
     def random_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Uniformly random actions; their latents scatter around the codewords and decode to the actions."""
-        rows = super().random_rows(rng, n)
-        k = th.as_tensor(rows[:, 0], device=self.device).long()
+        rows, columns = super().random_rows(rng, n), self.action_space.columns
+        k = th.as_tensor(columns.discrete_actions(rows), device=self.device)
         codebook = self.actor.codebook
         centres = codebook.representative_latents(k)
         latents = centres.clone()
@@ -268,7 +271,7 @@ class CHDPPolicy(HybridPolicy):
             if len(undecided) == 0:
                 break
             spread /= 2
-        rows[:, self.action_space.spec.row_size :] = latents.cpu().numpy()
+        columns.view(rows, "latents")[:] = latents.cpu().numpy()
         return rows
 
     def set_training_mode(self, mode: bool) -> None:

@@ -1,0 +1,160 @@
+"""
+What the parts of CHDP are good for: it without diffusion policies, without codebook, without sequential update.
+
+    python benchmarks/ablations.py ablation --jobs 2           of the algorithm as published
+    python benchmarks/ablations.py ablation_tuned --jobs 2     of CHDP with the settings of its YAML file
+
+Options are those of ``sb3-chdp benchmark``.
+"""
+
+from typing import ClassVar
+
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import create_mlp
+from torch import nn
+
+from sb3_chdp import CHDP
+from sb3_chdp.chdp import PaperCHDP
+from sb3_chdp.chdp.codebook import Codebook
+from sb3_chdp.chdp.diffusion import DiffusionModel
+from sb3_chdp.chdp.policies import CHDPPolicy
+from sb3_chdp.common.hybrid_box import HybridBox
+from sb3_chdp.common.samples import HybridReplaySamples
+
+# Standard deviation of the Gaussian noise that deterministic policies explore with
+EXPLORATION_NOISE = 0.1
+
+
+class DeterministicModel(DiffusionModel):
+    """
+    A tanh MLP with the interface of :class:`DiffusionModel`.
+
+    :param dim: width of the vector
+    :param condition_dim: width of the condition
+    :param net_arch: hidden layers
+    :param activation_fn: activation function
+    """
+
+    def __init__(self, dim: int, condition_dim: int, net_arch: list[int], activation_fn: type[nn.Module]):
+        nn.Module.__init__(self)
+        self.dim, self.n_steps = dim, 1
+        self.mlp = nn.Sequential(*create_mlp(condition_dim, dim, net_arch, activation_fn, squash_output=True))
+
+    def sample(self, condition: th.Tensor, mask: th.Tensor | None = None, noise: th.Tensor | None = None) -> th.Tensor:
+        """See :meth:`DiffusionModel.sample`; given noise asks for a repeatable sample, which is without exploration."""
+        x = self.mlp(condition)
+        if noise is None:
+            x = (x + EXPLORATION_NOISE * th.randn_like(x)).clamp(-1, 1)
+        return x if mask is None else x * mask
+
+    def diffusion_loss(self, x_start: th.Tensor, condition: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
+        """:return: 0, there is nothing to denoise"""
+        return th.zeros((), device=condition.device)
+
+
+class OneHotCodebook(Codebook):
+    """
+    One-hot vectors, decoded by arg max.
+
+    :param n_discrete_actions: number K of discrete actions, also the width
+    """
+
+    def __init__(self, n_discrete_actions: int):
+        super().__init__(n_discrete_actions, n_discrete_actions)
+        self.project()
+
+    def quantize(self, latents: th.Tensor) -> th.Tensor:
+        """:return: (B,) index of the largest entry"""
+        return latents.argmax(dim=1)
+
+    def representative_latents(self, k: th.Tensor) -> th.Tensor:
+        """:return: (B, K) vectors of 1 at k and -1 elsewhere"""
+        return 2 * self.codewords.detach()[k] - 1
+
+    def project(self) -> None:
+        """Take back what a gradient step did to the vectors."""
+        with th.no_grad():
+            nn.init.eye_(self.codewords)
+
+
+class DeterministicPolicies(CHDPPolicy):
+    """MLPs in place of both diffusion models."""
+
+    def _make_model(self, dim: int, condition_dim: int, net_arch: list[int]) -> DiffusionModel:
+        return DeterministicModel(dim, condition_dim, net_arch, self.activation_fn)
+
+
+class OneHotPolicy(CHDPPolicy):
+    """One-hot vectors in place of the codebook."""
+
+    def _make_codebook(self, n_discrete_actions: int, latent_dim: int) -> Codebook:
+        return OneHotCodebook(n_discrete_actions)
+
+
+class WithoutDiffusion(CHDP):
+    """Deterministic policies with Gaussian exploration noise."""
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": DeterministicPolicies}
+
+
+class WithoutCodebook(CHDP):
+    """Latents of width K, decoded by arg max; the continuous policy is conditioned on a one-hot vector."""
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": OneHotPolicy}
+
+    def _make_hybrid_space(self) -> HybridBox:
+        n_discrete_actions = HybridBox(self.action_space, self.action_layout).spec.n_discrete_actions
+        return HybridBox(self.action_space, self.action_layout, n_discrete_actions)
+
+
+class WithoutSequentialUpdate(CHDP):
+    """The continuous policy is improved for the stored actions, whatever the discrete policy does."""
+
+    def _actions_to_improve(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        latents, k = replay_data.latents, replay_data.discrete_actions
+        n_uniform = round(self.uniform_fraction * len(k))
+        if n_uniform > 0:
+            with th.no_grad():
+                uniform_latents, uniform_k, _ = self.actor.random_actions(n_uniform)
+            latents, k = th.cat([uniform_latents, latents[n_uniform:]]), th.cat([uniform_k, k[n_uniform:]])
+        return latents, k
+
+
+class WithoutBoth(WithoutCodebook, WithoutSequentialUpdate):
+    """:class:`WithoutCodebook` and :class:`WithoutSequentialUpdate`."""
+
+
+class PaperWithoutDiffusion(WithoutDiffusion, PaperCHDP):
+    """:class:`WithoutDiffusion` of the published algorithm."""
+
+
+class PaperWithoutCodebook(WithoutCodebook, PaperCHDP):
+    """:class:`WithoutCodebook` of the published algorithm."""
+
+
+class PaperWithoutSequentialUpdate(WithoutSequentialUpdate, PaperCHDP):
+    """:class:`WithoutSequentialUpdate` of the published algorithm."""
+
+
+class PaperWithoutBoth(WithoutBoth, PaperCHDP):
+    """:class:`WithoutBoth` of the published algorithm."""
+
+
+# Of both tables: rows by name
+ABLATIONS: dict[str, dict[str, type[CHDP]]] = {
+    "ablation": {
+        "full": PaperCHDP,
+        "without_diffusion": PaperWithoutDiffusion,
+        "without_codebook": PaperWithoutCodebook,
+        "without_sequential_update": PaperWithoutSequentialUpdate,
+        "without_both": PaperWithoutBoth,
+    },
+    "ablation_tuned": {
+        "full": CHDP,
+        "without_diffusion": WithoutDiffusion,
+        "without_codebook": WithoutCodebook,
+        "without_sequential_update": WithoutSequentialUpdate,
+        "without_both": WithoutBoth,
+    },
+}
