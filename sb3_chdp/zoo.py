@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import rl_zoo3.exp_manager
 from rl_zoo3.hyperparams_opt import (
     HYPERPARAMS_CONVERTER,
     HYPERPARAMS_SAMPLER,
@@ -12,6 +13,7 @@ from rl_zoo3.hyperparams_opt import (
 )
 from rl_zoo3.utils import ALGOS
 
+import sb3_chdp
 from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3, PDQNTD3, HyARTD3, samplers
 
 HYPERPARAMS_FOLDER = Path(__file__).parent / "hyperparams"
@@ -35,3 +37,5 @@ def register() -> None:
         ALGOS[name] = algorithm
         HYPERPARAMS_SAMPLER[name] = sampler
         HYPERPARAMS_CONVERTER[name] = converter
+    # rl_zoo3 evaluates replay_buffer_class and the like among its own imports: YAML files may name classes of this package
+    rl_zoo3.exp_manager.sb3_chdp = sb3_chdp  # type: ignore[attr-defined]

@@ -1,5 +1,7 @@
 """The two cooperating policies of CHDP with the codebook between them."""
 
+from typing import Any
+
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
@@ -32,7 +34,7 @@ class CooperativeActor(BaseModel):
 
     def __init__(
         self,
-        observation_space: spaces.Space,
+        observation_space: spaces.Space[Any],
         action_space: HybridBox,
         features_extractor: BaseFeaturesExtractor,
         codebook: Codebook,

@@ -180,7 +180,7 @@ class CHDP(HybridOffPolicyAlgorithm):
             device=device,
         )
         check_fraction(uniform_fraction=uniform_fraction)
-        check_at_least(1, latent_dim=latent_dim, policy_delay=policy_delay)
+        check_at_least(1, latent_dim=latent_dim, n_diffusion_steps=n_diffusion_steps, policy_delay=policy_delay)
         check_at_least(1, n_action_candidates=n_action_candidates, n_target_candidates=n_target_candidates)
         check_at_least(0, n_random_candidates=n_random_candidates, n_refinement_candidates=n_refinement_candidates)
         self.latent_dim = latent_dim
@@ -242,6 +242,7 @@ class CHDP(HybridOffPolicyAlgorithm):
             gradient_step(loss, critic_optimizers, self.max_grad_norm)
             policy.actor.codebook.project()
             if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
+                assert replay_data.indices is not None, "a prioritised buffer says where its samples are"
                 self.replay_buffer.update_priorities(replay_data.indices, errors)
             losses = {"critic_loss": loss, "q_mean": q_values.mean(), "latent_drift": drift}
 
@@ -307,7 +308,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         if not self.explore_parts:
             return super()._exploratory_rows(rows, rng)
         assert self._last_obs is not None, "self._last_obs was not set"
-        return vary_parts(self.policy, self._last_obs, rows, rng)  # type: ignore[arg-type]
+        return vary_parts(self.policy, self._last_obs, rows, rng)
 
     def _update_learning_rates(self) -> None:
         """Set the learning rates of all optimizers according to their schedules."""

@@ -22,7 +22,7 @@ class Codebook(nn.Module):
     def quantize(self, latents: th.Tensor) -> th.Tensor:
         """
         :param latents: (B, d_e)
-        :return: (B,) index k of the nearest codeword in squared Euclidean distance
+        :return: (B,) index k of the nearest codeword in squared Euclidean distance, the paper's eq. 12
         """
         return nearest_row(latents, self.codewords)
 

@@ -20,8 +20,8 @@ class PaperCHDP(CHDP):
     the codebook learns through the continuous chain only. Stored latents stay as they are.
 
     Paper: Liu et al., "CHDP: Cooperative Hybrid Diffusion Policies for Reinforcement Learning in Parameterized Action
-    Space", AAAI 2026. What it leaves open is as in :class:`CHDP`: the noise schedule, a bound of 1 on gradient norms, codewords
-    kept in [-1, 1].
+    Space", AAAI 2026. What it leaves open is as in :class:`CHDP`: the noise schedule, a bound of 1 on gradient norms,
+    codewords kept in [-1, 1].
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str), with a hybrid action space
