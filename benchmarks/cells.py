@@ -15,7 +15,7 @@ import numpy as np
 import stable_baselines3 as sb3
 import torch as th
 import yaml
-from rl_zoo3.utils import linear_schedule
+from rl_zoo3.utils import get_class_by_name, linear_schedule
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -184,6 +184,8 @@ def start_model(cell: Cell) -> tuple[BaseAlgorithm, list[dict[str, float]]]:
     if isinstance(hyperparams.get("learning_rate"), str):
         # rl_zoo3's notation: lin_0.001 falls to 0
         hyperparams["learning_rate"] = linear_schedule(hyperparams["learning_rate"].split("_")[1])
+    if isinstance(hyperparams.get("replay_buffer_class"), str):
+        hyperparams["replay_buffer_class"] = get_class_by_name(hyperparams["replay_buffer_class"])
     env = make_vec_env(cell.env_id, n_envs, seed=cell.seed)
     if not cell.path(".checkpoint.zip").exists():
         return ALGORITHMS[cell.algo](env=env, seed=cell.seed, device="cpu", **hyperparams), []
