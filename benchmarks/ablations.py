@@ -1,10 +1,7 @@
 """
 What the parts of CHDP are good for: it without diffusion policies, without codebook, without sequential update.
 
-    python benchmarks/ablations.py ablation --jobs 2           of the algorithm as published
-    python benchmarks/ablations.py ablation_tuned --jobs 2     of CHDP with the settings of its YAML file
-
-Options are those of ``sb3-chdp benchmark``.
+Each is a subclass of CHDP, and of PaperCHDP, the algorithm as published. ``MlpPolicy`` only.
 """
 
 from typing import ClassVar
@@ -141,20 +138,14 @@ class PaperWithoutBoth(WithoutBoth, PaperCHDP):
     """:class:`WithoutBoth` of the published algorithm."""
 
 
-# Of both tables: rows by name
-ABLATIONS: dict[str, dict[str, type[CHDP]]] = {
-    "ablation": {
-        "full": PaperCHDP,
-        "without_diffusion": PaperWithoutDiffusion,
-        "without_codebook": PaperWithoutCodebook,
-        "without_sequential_update": PaperWithoutSequentialUpdate,
-        "without_both": PaperWithoutBoth,
-    },
-    "ablation_tuned": {
-        "full": CHDP,
-        "without_diffusion": WithoutDiffusion,
-        "without_codebook": WithoutCodebook,
-        "without_sequential_update": WithoutSequentialUpdate,
-        "without_both": WithoutBoth,
-    },
+# By name; CHDP and PaperCHDP themselves have everything
+ABLATIONS: dict[str, type[CHDP]] = {
+    "chdp_without_diffusion": WithoutDiffusion,
+    "chdp_without_codebook": WithoutCodebook,
+    "chdp_without_sequential_update": WithoutSequentialUpdate,
+    "chdp_without_both": WithoutBoth,
+    "chdp_paper_without_diffusion": PaperWithoutDiffusion,
+    "chdp_paper_without_codebook": PaperWithoutCodebook,
+    "chdp_paper_without_sequential_update": PaperWithoutSequentialUpdate,
+    "chdp_paper_without_both": PaperWithoutBoth,
 }

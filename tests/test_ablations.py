@@ -17,18 +17,21 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import ablations
 
-TABLES = list(ablations.ABLATIONS)
-CASES = [(table, name) for table in TABLES for name in ablations.ABLATIONS[table]]
+PREFIXES = {"chdp_": CHDP, "chdp_paper_": PaperCHDP}
+NAMES = ("full", "without_diffusion", "without_codebook", "without_sequential_update", "without_both")
+TABLES = list(PREFIXES)
+CASES = [(table, name) for table in TABLES for name in NAMES]
 
 
 def make(table, name, env=None, **kwargs):
-    return filled_model(env, algorithm_class=ablations.ABLATIONS[table][name], **kwargs)
+    algorithm = PREFIXES[table] if name == "full" else ablations.ABLATIONS[table + name]
+    return filled_model(env, algorithm_class=algorithm, **kwargs)
 
 
 @pytest.mark.parametrize("table, name", CASES)
 def test_they_run(table, name, tmp_path):
     model = make(table, name, make_layout_env("nested"))
-    assert isinstance(model, PaperCHDP) == (table == "ablation")
+    assert isinstance(model, PaperCHDP) == (table == "chdp_paper_")
     model.learning_starts = 60
     model.learn(20, reset_num_timesteps=False)
     assert model._n_updates == 20
@@ -66,8 +69,7 @@ def test_without_diffusion(table):
 def test_without_codebook(table, name):
     """Latents are as wide as there are actions, the largest entry decides, and training changes nothing of that."""
     env = LayoutEnv(spaces.Tuple((spaces.Discrete(7), box(-1, 1, 2))))
-    model = make(table, name, env)
-    kwargs = {} if table == "ablation" else {"critics_train_codebook": True}
+    kwargs = {} if table == "chdp_paper_" else {"critics_train_codebook": True}
     model = make(table, name, env, **kwargs)
     model.train(3, 32)
     codebook = model.actor.codebook
@@ -83,13 +85,13 @@ def test_without_codebook(table, name):
 @pytest.mark.parametrize("table, name", CASES)
 def test_sequential_update(table, name, monkeypatch):
     """Which actions the continuous policy is improved for: those of the updated discrete policy, or the stored ones."""
-    kwargs = {} if table == "ablation" else {"uniform_fraction": 0.25}
+    kwargs = {} if table == "chdp_paper_" else {"uniform_fraction": 0.25}
     model = make(table, name, **kwargs)
     codewords = model.actor.codebook.representative_latents(th.arange(3))
     model.actor.discrete_policy.sample = lambda features, mask=None, noise=None: codewords[2].expand(len(features), -1)
     data = model._sample_batch(400)
     latents, k = model._actions_to_improve(data, data.observations)
-    n_uniform = 0 if table == "ablation" else 100
+    n_uniform = 0 if table == "chdp_paper_" else 100
     is_sequential = name not in ("without_sequential_update", "without_both")
     assert len(latents) == len(k) == 400
     assert (k[n_uniform:] == (2 if is_sequential else data.discrete_actions[n_uniform:])).all()
@@ -99,7 +101,7 @@ def test_sequential_update(table, name, monkeypatch):
 @pytest.mark.parametrize("table", TABLES)
 def test_what_is_left_is_the_full_algorithm(table):
     """Arguments that the algorithm has, its ablations have with the same values."""
-    models = {name: make(table, name, HybridIdentityEnv()) for name in ablations.ABLATIONS[table]}
+    models = {name: make(table, name, HybridIdentityEnv()) for name in NAMES}
     settings = {name: model._network_kwargs() for name, model in models.items()}
     assert all(settings[name] == settings["full"] for name in models)
     for model in models.values():
