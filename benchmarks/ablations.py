@@ -1,75 +1,169 @@
 """
 What the parts of CHDP are good for: it without diffusion policies, without codebook, without sequential update.
 
-    python benchmarks/ablations.py ablation --jobs 2           with the paper's settings
-    python benchmarks/ablations.py ablation_tuned --jobs 2     with those of the YAML file
+Each is a subclass of CHDP, and of PaperCHDP, the algorithm as published. ``MlpPolicy`` only. In this folder:
 
-Options are those of ``sb3-chdp benchmark``. ``publish.py`` makes the tables.
+    sb3-chdp benchmark --gym-packages ablations --algos chdp_paper chdp_paper_without_codebook --envs HardMove6-v0
 """
 
-import sys
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
-from rich.console import Console
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import create_mlp
+from torch import nn
 
-from sb3_chdp.benchmark.cli import make_runs, parse, train_all
-from sb3_chdp.benchmark.paper import EVAL_EPISODES
+from sb3_chdp import CHDP
+from sb3_chdp.chdp import PaperCHDP
+from sb3_chdp.chdp.codebook import Codebook
+from sb3_chdp.chdp.diffusion import DiffusionModel
+from sb3_chdp.chdp.policies import CHDPPolicy
+from sb3_chdp.common.hybrid_box import HybridBox
+from sb3_chdp.common.samples import HybridReplaySamples
+from sb3_chdp.registry import ALGORITHMS, Algorithm
+from sb3_chdp.zoo import register
 
-RESULTS = Path(__file__).parent / "results"
-TABLES = {"ablation": "Ablation with the paper's settings", "ablation_tuned": "Ablation with our settings"}
-ENVS = ("HardGoal-v0", "HardMove6-v0")
-SEEDS = ("10", "11", "12")
-# The paper's default parameters, losses and critics, and no search beyond the policies' own draws, which may cover up what
-# they lack
-PAPER_SETTINGS: dict[str, Any] = {
-    "n_diffusion_steps": 15,
-    "eta": 10.0,
-    "latent_dim": 8,
-    "improvement_parameters": "stored",
-    "uniform_fraction": 0.0,
-    "n_random_candidates": 0,
-    "n_refinement_candidates": 0,
-    "critics_train_codebook": False,
-    "prioritized_replay": False,
-    "codebook_lr_factor": 0.1,
-    "n_target_candidates": 1,
-    "policy_kwargs": {"whitening": False, "layer_norm": False, "parameter_degree": 1, "bilinear": False},
+# Standard deviation of the Gaussian noise that deterministic policies explore with
+EXPLORATION_NOISE = 0.1
+
+
+class DeterministicModel(DiffusionModel):
+    """
+    A tanh MLP with the interface of :class:`DiffusionModel`.
+
+    :param dim: width of the vector
+    :param condition_dim: width of the condition
+    :param net_arch: hidden layers
+    :param activation_fn: activation function
+    """
+
+    def __init__(self, dim: int, condition_dim: int, net_arch: list[int], activation_fn: type[nn.Module]):
+        nn.Module.__init__(self)
+        self.dim, self.n_steps = dim, 1
+        self.mlp = nn.Sequential(*create_mlp(condition_dim, dim, net_arch, activation_fn, squash_output=True))
+
+    def sample(self, condition: th.Tensor, mask: th.Tensor | None = None, noise: th.Tensor | None = None) -> th.Tensor:
+        """See :meth:`DiffusionModel.sample`; given noise asks for a repeatable sample, which is without exploration."""
+        x = self.mlp(condition)
+        if noise is None:
+            x = (x + EXPLORATION_NOISE * th.randn_like(x)).clamp(-1, 1)
+        return x if mask is None else x * mask
+
+    def diffusion_loss(self, x_start: th.Tensor, condition: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
+        """:return: 0, there is nothing to denoise"""
+        return th.zeros((), device=condition.device)
+
+
+class OneHotCodebook(Codebook):
+    """
+    One-hot vectors, decoded by arg max.
+
+    :param n_discrete_actions: number K of discrete actions, also the width
+    """
+
+    def __init__(self, n_discrete_actions: int):
+        super().__init__(n_discrete_actions, n_discrete_actions)
+        self.project()
+
+    def quantize(self, latents: th.Tensor) -> th.Tensor:
+        """:return: (B,) index of the largest entry"""
+        return latents.argmax(dim=1)
+
+    def representative_latents(self, k: th.Tensor) -> th.Tensor:
+        """:return: (B, K) vectors of 1 at k and -1 elsewhere"""
+        return 2 * self.codewords.detach()[k] - 1
+
+    def project(self) -> None:
+        """Take back what a gradient step did to the vectors."""
+        with th.no_grad():
+            nn.init.eye_(self.codewords)
+
+
+class DeterministicPolicies(CHDPPolicy):
+    """MLPs in place of both diffusion models."""
+
+    def _make_model(self, dim: int, condition_dim: int, net_arch: list[int]) -> DiffusionModel:
+        return DeterministicModel(dim, condition_dim, net_arch, self.activation_fn)
+
+
+class OneHotPolicy(CHDPPolicy):
+    """One-hot vectors in place of the codebook."""
+
+    def _make_codebook(self, n_discrete_actions: int, latent_dim: int) -> Codebook:
+        return OneHotCodebook(n_discrete_actions)
+
+
+class WithoutDiffusion(CHDP):
+    """Deterministic policies with Gaussian exploration noise."""
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": DeterministicPolicies}
+
+
+class WithoutCodebook(CHDP):
+    """Latents of width K, decoded by arg max; the continuous policy is conditioned on a one-hot vector."""
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": OneHotPolicy}
+
+    def _make_hybrid_space(self) -> HybridBox:
+        n_discrete_actions = HybridBox(self.action_space, self.action_layout).spec.n_discrete_actions
+        return HybridBox(self.action_space, self.action_layout, n_discrete_actions)
+
+
+class WithoutSequentialUpdate(CHDP):
+    """The continuous policy is improved for the stored actions, whatever the discrete policy does."""
+
+    def _actions_to_improve(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        latents, k = replay_data.latents, replay_data.discrete_actions
+        n_uniform = round(self.uniform_fraction * len(k))
+        if n_uniform > 0:
+            with th.no_grad():
+                uniform_latents, uniform_k, _ = self.actor.random_actions(n_uniform)
+            latents, k = th.cat([uniform_latents, latents[n_uniform:]]), th.cat([uniform_k, k[n_uniform:]])
+        return latents, k
+
+
+class WithoutBoth(WithoutCodebook, WithoutSequentialUpdate):
+    """:class:`WithoutCodebook` and :class:`WithoutSequentialUpdate`."""
+
+
+class PaperWithoutDiffusion(WithoutDiffusion, PaperCHDP):
+    """:class:`WithoutDiffusion` of the published algorithm."""
+
+
+class PaperWithoutCodebook(WithoutCodebook, PaperCHDP):
+    """:class:`WithoutCodebook` of the published algorithm."""
+
+
+class PaperWithoutSequentialUpdate(WithoutSequentialUpdate, PaperCHDP):
+    """:class:`WithoutSequentialUpdate` of the published algorithm."""
+
+
+class PaperWithoutBoth(WithoutBoth, PaperCHDP):
+    """:class:`WithoutBoth` of the published algorithm."""
+
+
+@dataclass(frozen=True)
+class Ablation(Algorithm):
+    """An algorithm with the hyperparameters of the one that it is a variant of."""
+
+    @property
+    def hyperparams(self) -> Path:
+        return ALGORITHMS[self.name.split("_without_")[0]].hyperparams
+
+
+# By name; CHDP and PaperCHDP themselves have everything
+ABLATIONS: dict[str, type[CHDP]] = {
+    "chdp_without_diffusion": WithoutDiffusion,
+    "chdp_without_codebook": WithoutCodebook,
+    "chdp_without_sequential_update": WithoutSequentialUpdate,
+    "chdp_without_both": WithoutBoth,
+    "chdp_paper_without_diffusion": PaperWithoutDiffusion,
+    "chdp_paper_without_codebook": PaperWithoutCodebook,
+    "chdp_paper_without_sequential_update": PaperWithoutSequentialUpdate,
+    "chdp_paper_without_both": PaperWithoutBoth,
 }
-VARIANTS: dict[str, dict[str, Any]] = {
-    "full": {},
-    "without_diffusion": {"diffusion": False},
-    "without_codebook": {"codebook": False},
-    "without_sequential_update": {"sequential_update": False},
-    "without_both": {"codebook": False, "sequential_update": False},
-}
-# The paper's success rates in percent, mean and standard deviation, in the order of the variants
-PAPER = {
-    "HardGoal-v0": ("81.8 ± 3.5", "49.8 ± 26.9", "73.3 ± 7.8", "53.5 ± 14.5", "52.4 ± 13.7"),
-    "HardMove6-v0": ("94.4 ± 1.2", "88.2 ± 5.6", "56.1 ± 12.5", "92.3 ± 4.5", "54.6 ± 9.6"),
-}
-
-
-def paper_column(row: str, env: str) -> str:
-    """:return: what the paper prints for a variant"""
-    return dict(zip(VARIANTS, PAPER[env], strict=True))[row]
-
-
-def main() -> None:
-    table, *options = sys.argv[1:] or [""]
-    if table not in TABLES:
-        sys.exit(__doc__)
-    defaults = ["--algos", "chdp", "--envs", *ENVS, "--seeds", *SEEDS, "--out", str(RESULTS / table)]
-    args, slurm = parse([*defaults, "--eval-episodes", str(EVAL_EPISODES), *options])
-    settings = PAPER_SETTINGS if table == "ablation" else {}
-    runs = [
-        replace(run, name=name, overrides={**settings, **variant, **run.overrides})
-        for run in make_runs(args)
-        for name, variant in VARIANTS.items()
-    ]
-    sys.exit("\n".join(train_all(runs, args, slurm, Console())) or 0)
-
-
-if __name__ == "__main__":
-    main()
+for _name, _class in ABLATIONS.items():
+    ALGORITHMS[_name] = Ablation(_name, _name.replace("_", " "), f"{__name__}.{_class.__name__}")
+register()

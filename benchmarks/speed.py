@@ -18,19 +18,18 @@ import gymnasium as gym
 import numpy as np
 import stable_baselines3 as sb3
 import torch as th
-from dql_style import DQLStyleCHDP
 from gymnasium import spaces
 from publish import README, replace_section
 from stable_baselines3 import TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from torch import nn
 from torch.profiler import ProfilerActivity, profile
 
 import sb3_chdp
 from sb3_chdp import ALGORITHMS, CHDP, HPPO, PDQNTD3, FlattenHybridAction, HybridActionSpec
 from sb3_chdp.benchmark.training import machine
+from sb3_chdp.chdp import PaperCHDP
 
 ENV_ID = "HardMove6-v0"
 # Of the originals with a uniformly random policy: frames per second for Platform (with numba) and Goal, else steps
@@ -132,22 +131,21 @@ def conversion(repeats: int) -> Iterator[str]:
 
 
 def step(repeats: int) -> Iterator[str]:
-    """(a) gradient step of CHDP against chains in the style of the Diffusion Q-learning code, 15 denoising steps"""
-    cases: list[tuple[str, type[CHDP], int, dict[str, Any]]] = [
-        ("CHDP, defaults (2 x 128, SiLU)", CHDP, 128, {}),
-        ("DQL style, its defaults (3 x 256, Mish)", DQLStyleCHDP, 256,
-         dict(net_arch=dict(pi=[256] * 3, qf=[256] * 3), activation_fn=nn.Mish, optimizer_kwargs={})),
-        ("CHDP, 2 x 256, SiLU", CHDP, 256, BIG),
-        ("DQL style, 2 x 256, SiLU", DQLStyleCHDP, 256, dict(BIG, activation_fn=nn.SiLU, optimizer_kwargs={})),
-        ("DQL style, 2 x 256, Mish", DQLStyleCHDP, 256, dict(BIG, activation_fn=nn.Mish, optimizer_kwargs={})),
-    ]  # fmt: skip
-    models = [build(algorithm, policy_kwargs=kwargs or None) for _, algorithm, _, kwargs in cases]
-    seconds = medians([lambda m=m, b=c[2]: m.train(1, b) for m, c in zip(models, cases, strict=True)], repeats)
-    yield "| gradient step | batch | milliseconds | DQL style takes |\n|---|---|---|---|"
-    for (name, algorithm, batch_size, _), value in zip(cases, seconds, strict=True):
-        ours = seconds[0] if "its defaults" in name else seconds[2]
-        ratio = f"{value / ours:.1f} x" if algorithm is DQLStyleCHDP else ""
-        yield f"| {name} | {batch_size} | {1e3 * value:.1f} | {ratio} |"
+    """(a) gradient step of CHDP against SB3's TD3, both with batches of 128; TD3 on the flattened environment, 2 x 256"""
+    cases: list[tuple[str, type[BaseAlgorithm], int, dict[str, Any]]] = [
+        # Every other step of TD3 updates its policy
+        ("SB3's TD3", TD3, 2, dict(wrapper=FlattenHybridAction, policy_kwargs=dict(net_arch=[256, 256]))),
+        ("CHDP, defaults", CHDP, 1, {}),
+        ("CHDP, N = 5", CHDP, 1, dict(n_diffusion_steps=5)),
+        ("CHDP, N = 5, 2 x 256", CHDP, 1, dict(n_diffusion_steps=5, policy_kwargs=BIG)),
+        ("PaperCHDP", PaperCHDP, 1, {}),
+    ]
+    models = [build(algorithm, **kwargs) for _, algorithm, _, kwargs in cases]
+    seconds = medians([lambda m=m, n=case[2]: m.train(n, 128) for m, case in zip(models, cases, strict=True)], repeats)
+    per_step = [value / case[2] for value, case in zip(seconds, cases, strict=True)]
+    yield "| gradient step | ratio to TD3 | milliseconds |\n|---|---|---|"
+    for (name, *_), value in zip(cases, per_step, strict=True):
+        yield f"| {name} | {value / per_step[0]:.2f} | {1e3 * value:.2f} |"
 
 
 def matrix_products(repeats: int) -> Iterator[str]:

@@ -57,6 +57,7 @@ class Algorithm:
 
 _LINES = (
     Algorithm("chdp", "CHDP", "sb3_chdp.chdp.CHDP", "sb3_chdp.chdp.tuning"),
+    Algorithm("chdp_paper", "CHDP as published", "sb3_chdp.chdp.PaperCHDP"),
     Algorithm("hppo", "HPPO", "sb3_chdp.hppo.HPPO", "sb3_chdp.hppo.tuning"),
     Algorithm("pa_td3", "PA-TD3", "sb3_chdp.pa_td3.PATD3", "sb3_chdp.common.td3_tuning"),
     Algorithm("pdqn_td3", "PDQN-TD3", "sb3_chdp.pdqn_td3.PDQNTD3", "sb3_chdp.pdqn_td3.tuning"),

@@ -7,6 +7,7 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
 from stable_baselines3.common.vec_env import VecEnv
 
+import sb3_chdp
 from sb3_chdp.registry import ALGORITHMS
 
 
@@ -17,6 +18,8 @@ def register() -> None:
         tuning = algorithm.load_tuning()
         if tuning is not None:
             HYPERPARAMS_SAMPLER[name], HYPERPARAMS_CONVERTER[name] = tuning
+    # rl_zoo3 evaluates replay_buffer_class and the like among its own imports: YAML files may name classes of this package
+    rl_zoo3.exp_manager.sb3_chdp = sb3_chdp  # type: ignore[attr-defined]
     # Where rl_zoo3.train takes it from
     rl_zoo3.exp_manager.ExperimentManager = HybridExperimentManager  # type: ignore[misc]
 

@@ -4,6 +4,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_chdp import ALGORITHMS as REGISTRY
 from sb3_chdp import CHDP
+from sb3_chdp.chdp import PaperCHDP
 from tests.hybrid_envs import HybridIdentityEnv, layouts
 
 OFF_POLICY = dict(batch_size=8, learning_starts=12, buffer_size=500)
@@ -42,9 +43,14 @@ FAST_CHDP = dict(
 )  # fmt: skip
 
 
-def filled_model(env=None, **kwargs):
-    """A CHDP model with 60 random transitions that has not been trained."""
-    model = CHDP("MlpPolicy", env or HybridIdentityEnv(), **{**FAST_CHDP, **kwargs})
+# PaperCHDP has no candidates
+PAPER_FAST = {key: value for key, value in FAST_CHDP.items() if key != "n_action_candidates"}
+
+
+def filled_model(env=None, algorithm_class=CHDP, **kwargs):
+    """A model of CHDP, or of a class derived from it, with 60 random transitions that has not been trained."""
+    settings = PAPER_FAST if issubclass(algorithm_class, PaperCHDP) else FAST_CHDP
+    model = algorithm_class("MlpPolicy", env or HybridIdentityEnv(), **{**settings, **kwargs})
     model.learning_starts = 10**9
     model.learn(60)
     return model

@@ -30,8 +30,7 @@ def filled_buffer(n_times=10, size=10, n_envs=4, **kwargs):
 
 def set_errors(buffer, errors):
     """Every transition has the given error, as if all had been in a batch."""
-    buffer._last_batch = tuple(np.indices(errors.shape).reshape(2, -1))
-    buffer.update_priorities(th.as_tensor(errors.reshape(-1)))
+    buffer.update_priorities(tuple(np.indices(errors.shape).reshape(2, -1)), th.as_tensor(errors.reshape(-1)))
 
 
 def numbers(batch):
@@ -62,6 +61,8 @@ def test_a_batch_holds_what_was_stored():
     np.testing.assert_array_equal(batch.observations, np.stack([number, -number], axis=1))
     np.testing.assert_array_equal(batch.next_observations, np.stack([number + 0.5, -number + 0.5], axis=1))
     np.testing.assert_array_equal(batch.actions[:, 0], number)
+    # Where they are stored
+    np.testing.assert_array_equal(batch.indices[0] * 100 + batch.indices[1], number)
     # Environment 1 is always done, in every third step for lack of time
     np.testing.assert_array_equal(batch.dones[:, 0], (number % 100 == 1) & (number // 100 % 3 != 0))
     assert batch.dones.any()
@@ -70,8 +71,7 @@ def test_a_batch_holds_what_was_stored():
 def test_new_transitions_have_the_highest_priority():
     buffer = filled_buffer(n_times=6)
     set_errors(buffer, np.full((6, 4), 5.0))
-    buffer.sample(1)
-    buffer.update_priorities(th.tensor([-0.1]))
+    buffer.update_priorities(buffer.sample(1).indices, th.tensor([-0.1]))
     assert buffer.priorities[:6].min() < 1 and buffer.priorities[6:].max() == 0, "nothing is there yet"
     buffer.add(np.zeros((4, 2)), np.zeros((4, 2)), np.zeros((4, 1)), np.zeros(4), np.zeros(4), [{}] * 4)
     np.testing.assert_allclose(buffer.priorities[6], (5 + PRIORITY_EPSILON) ** 0.6, rtol=1e-6)
@@ -110,7 +110,8 @@ def test_observations_in_a_dict_are_normalised():
 
 def test_chdp_sets_priorities_to_the_errors_of_its_critics(tmp_path):
     env = make_vec_env(HybridIdentityEnv, 2, seed=0)
-    model = CHDP("MlpPolicy", env, **FAST_CHDP, prioritized_replay=True, replay_buffer_kwargs=dict(alpha=1.0)).learn(100)
+    settings = dict(FAST_CHDP, replay_buffer_class=PrioritizedReplayBuffer, replay_buffer_kwargs=dict(alpha=1.0))
+    model = CHDP("MlpPolicy", env, **settings).learn(100)
     buffer = model.replay_buffer
     assert isinstance(buffer, PrioritizedReplayBuffer) and buffer.alpha == 1
     data = model._sample_batch(16)
@@ -120,8 +121,26 @@ def test_chdp_sets_priorities_to_the_errors_of_its_critics(tmp_path):
     both = th.cat([q1, q2], dim=1) - data.rewards
     th.testing.assert_close(errors, both.abs().max(dim=1).values.detach())
     th.testing.assert_close(loss, (data.weights * both**2).mean() * 2)
-    buffer.update_priorities(errors)
-    np.testing.assert_allclose(buffer.priorities[buffer._last_batch], errors + PRIORITY_EPSILON, rtol=1e-5)
+
+    # A gradient step leaves the errors that its critics had before it
+    model.learning_rate = 0.0
+    model._setup_lr_schedule()
+    buffer.priorities[:50] = 7.0
+    model.train(1, 16)
+    changed = buffer.priorities[:50] != 7
+    assert 0 < changed.sum() <= 16
+    k, parameters, latents = (
+        th.as_tensor(model.hybrid_space.columns.view(buffer.actions[:50], name)[changed])
+        for name in ("discrete_actions", "parameters", "latents")
+    )
+    latents = th.where(
+        (model.actor.codebook.quantize(latents) == k[:, 0])[:, None],
+        latents, model.actor.codebook.representative_latents(k[:, 0].long()),
+    )  # fmt: skip
+    with th.no_grad():
+        q_values = th.cat(model.critic.q_values(th.as_tensor(buffer.observations[:50][changed]), latents, parameters), dim=1)
+    expected = (q_values - th.as_tensor(buffer.rewards[:50][changed])[:, None]).abs().max(dim=1).values
+    np.testing.assert_allclose(buffer.priorities[:50][changed], expected + PRIORITY_EPSILON, rtol=1e-4)
 
     model.save(tmp_path / "model")
     model.save_replay_buffer(tmp_path / "buffer")
@@ -133,12 +152,11 @@ def test_chdp_sets_priorities_to_the_errors_of_its_critics(tmp_path):
 
 def test_chdp_prioritises_transitions_with_dict_observations():
     env = make_layout_env(observation_space=spaces.Dict(vector=spaces.Box(-1, 1, (2,))))
-    model = CHDP("MultiInputPolicy", env, **FAST_CHDP, prioritized_replay=True).learn(60)
+    model = CHDP("MultiInputPolicy", env, **FAST_CHDP, replay_buffer_class=PrioritizedDictReplayBuffer).learn(60)
     assert isinstance(model.replay_buffer, PrioritizedDictReplayBuffer)
     assert len(np.unique(model.replay_buffer.priorities[:60])) > 10, "they are updated"
 
 
-def test_prioritized_replay_excludes_other_buffers():
-    for kwargs in (dict(n_steps=3), dict(replay_buffer_class=PrioritizedReplayBuffer)):
-        with pytest.raises(ValueError, match="prioritized_replay"):
-            CHDP("MlpPolicy", HybridIdentityEnv(), prioritized_replay=True, **kwargs)
+def test_prioritised_replay_is_of_single_steps():
+    with pytest.warns(UserWarning, match="n_steps=3.* is ignored"):
+        CHDP("MlpPolicy", HybridIdentityEnv(), n_steps=3, replay_buffer_class=PrioritizedReplayBuffer)

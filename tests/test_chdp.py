@@ -8,9 +8,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from torch.nn import functional as F
 
 from sb3_chdp import CHDP
-from sb3_chdp.chdp import chdp, losses
+from sb3_chdp.chdp import PaperCHDP, chdp, losses
+from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.utils import gradient_step
-from tests.algorithms import FAST_CHDP, filled_model
+from tests.algorithms import FAST_CHDP, PAPER_FAST, filled_model
 from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box
 
 
@@ -34,20 +35,20 @@ def networks_with_gradient(model, loss):
 
 
 def batch_of(model, size=32):
-    return losses.relabel_latents(model.policy, model._sample_batch(size), model.relabel_latents)[0]
+    return model._latents_of_today(model._sample_batch(size))[0]
 
 
 def actions_of_continuous_loss(model, data):
-    features = model.policy.actor_features(data.observations)
-    options = model.improvement_q, model.sequential_update, model.uniform_fraction
-    return losses.continuous_policy_loss(model.policy, data, features, features, *options)[2]
+    return model._actions_to_improve(data, model.policy.actor_features(data.observations).detach())[1]
 
 
 def all_losses(model):
-    data, policy, q = batch_of(model), model.policy, model.improvement_q
-    features = (policy.actor_features(data.observations), model.critic.features(data.observations).detach())
-    discrete = losses.discrete_policy_loss(policy, data, *features, q, model.improvement_parameters)
-    continuous = losses.continuous_policy_loss(policy, data, *features, q, model.sequential_update, model.uniform_fraction)
+    data, policy = batch_of(model), model.policy
+    features, critic_features = policy.actor_features(data.observations), model.critic.features(data.observations).detach()
+    discrete = losses.discrete_policy_loss(policy, data, features, critic_features, model._parameters_of_latents(data))
+    features = features.detach()
+    latents, k = model._actions_to_improve(data, features)
+    continuous = losses.continuous_policy_loss(policy, data, features, critic_features, latents, k)
     return {
         "critic": losses.critic_loss(model.policy, data, model.n_target_candidates)[0],
         "discrete diffusion": discrete[0],
@@ -69,25 +70,28 @@ GRADIENTS = {
 }
 
 
-@pytest.mark.parametrize("improvement_parameters", losses.IMPROVEMENT_PARAMETERS)
+@pytest.mark.parametrize("algorithm_class", [CHDP, PaperCHDP])
 @pytest.mark.parametrize("loss", GRADIENTS)
-def test_gradient_routing(loss, improvement_parameters):
-    model = filled_model(improvement_parameters=improvement_parameters)
+def test_gradient_routing(loss, algorithm_class):
+    model = filled_model(algorithm_class=algorithm_class)
     assert networks_with_gradient(model, all_losses(model)[loss]) == GRADIENTS[loss]
 
 
-def test_codebook_gradient_comes_through_the_continuous_chain_only():
+@pytest.mark.parametrize("algorithm_class", [CHDP, PaperCHDP])
+def test_codebook_gradient_comes_through_the_continuous_chain_only(algorithm_class):
     """With a chain that ignores its condition the codebook gets no gradient, though Q depends on everything."""
-    model = filled_model()
+    model = filled_model(algorithm_class=algorithm_class)
     with th.no_grad():
-        model.actor.continuous_policy.noise_predictor.condition_weight.zero_()
+        model.actor.continuous_policy.noise_predictor.split_first_layer()[2].zero_()
     assert "codebook" not in networks_with_gradient(model, all_losses(model)["continuous improvement"])
 
 
-@pytest.mark.parametrize("critics_train_codebook", [False, True])
-def test_each_step_moves_its_own_networks_only(critics_train_codebook, monkeypatch):
-    model = filled_model(critics_train_codebook=critics_train_codebook)
-    policy, moved = model.policy, []
+@pytest.mark.parametrize(
+    "algorithm_class, kwargs", [(CHDP, {}), (CHDP, dict(critics_train_codebook=True)), (PaperCHDP, {})], ids=str
+)
+def test_each_step_moves_its_own_networks_only(algorithm_class, kwargs, monkeypatch):
+    model = filled_model(algorithm_class=algorithm_class, **kwargs)
+    moved = []
 
     def spy(*args):
         before = {name: [p.detach().clone() for p in params] for name, params in networks(model).items()}
@@ -97,9 +101,8 @@ def test_each_step_moves_its_own_networks_only(critics_train_codebook, monkeypat
 
     monkeypatch.setattr(chdp, "gradient_step", spy)
     model.train(1, 32)
-    first = {"critic", "codebook"} if critics_train_codebook else {"critic"}
+    first = {"critic", "codebook"} if kwargs else {"critic"}
     assert moved == [first, {"discrete"}, {"continuous", "codebook"}]
-    assert policy.codebook_optimizer is not None
 
 
 @pytest.mark.parametrize("critics_train_codebook", [False, True])
@@ -137,12 +140,6 @@ def test_continuous_step_sees_the_updated_discrete_policy(monkeypatch):
     assert (data.discrete_actions != 2).any()
 
 
-def test_without_sequential_update_the_stored_actions_are_used():
-    model = filled_model(sequential_update=False, uniform_fraction=0)
-    data = batch_of(model)
-    assert (actions_of_continuous_loss(model, data) == data.discrete_actions).all()
-
-
 def test_uniform_fraction():
     """Part of the batch takes uniformly random actions, the rest those of the discrete policy."""
     model = filled_model(uniform_fraction=0.25)
@@ -152,26 +149,55 @@ def test_uniform_fraction():
     assert th.bincount(k[:100], minlength=3).min() > 15
 
 
-@pytest.mark.parametrize("improvement_parameters", losses.IMPROVEMENT_PARAMETERS)
-def test_parameters_with_which_latents_are_valued(improvement_parameters):
-    model = filled_model(improvement_parameters=improvement_parameters)
+@pytest.mark.parametrize("algorithm_class", [CHDP, PaperCHDP])
+def test_parameters_with_which_latents_are_valued(algorithm_class):
+    """The paper takes the stored ones, CHDP those that the continuous policy draws."""
+    model = filled_model(algorithm_class=algorithm_class)
     force_action(model, 1)
     # Parameters of 0.5 for action 1, -0.5 for the others
     model.actor.sample_parameters = lambda features, k: (k[:, None] == 1).float() - 0.5
-    data, features = batch_of(model), model.policy.actor_features
+    data = batch_of(model)
     seen = []
     model.critic.q_networks[0].register_forward_pre_hook(lambda module, args: seen.append(args[0]))
-    obs = features(data.observations)
-    losses.discrete_policy_loss(model.policy, data, obs, obs, "q1", improvement_parameters)
-    expected = data.parameters if improvement_parameters == "stored" else th.full_like(data.parameters, 0.5)
+    obs = model.policy.actor_features(data.observations)
+    losses.discrete_policy_loss(model.policy, data, obs, obs, model._parameters_of_latents(data))
+    expected = data.parameters if algorithm_class is PaperCHDP else th.full_like(data.parameters, 0.5)
     assert th.equal(seen[0][:, -1:], expected)
+
+
+def test_the_paper_improves_what_its_discrete_policy_draws():
+    model = filled_model(algorithm_class=PaperCHDP)
+    force_action(model, 2)
+    assert (actions_of_continuous_loss(model, batch_of(model, 400)) == 2).all()
+
+
+def test_the_paper_explores_in_the_warm_up_alone():
+    """Then a draw of its policies acts, whatever the critics say of it."""
+    model = filled_model(algorithm_class=PaperCHDP)
+    assert len(np.unique(model.replay_buffer.actions[:60, 0, 0])) == 3
+    force_action(model, 2)
+    model.learning_starts = 60
+    model.gradient_steps = 0
+    drawn, sample_parameters = [], model.actor.sample_parameters
+
+    def spy(*args):
+        drawn.append(sample_parameters(*args))
+        return drawn[-1]
+
+    model.actor.sample_parameters = spy
+    model.critic_target.q_values = lambda features, latents, parameters: (th.zeros(len(latents), 1),) * 2
+    model.learn(100, reset_num_timesteps=False)
+    acted = model.replay_buffer.actions[60:160, 0]
+    assert (acted[:, 0] == 2).all()
+    assert [parameters.shape for parameters in drawn] == [(1, 1)] * 100, "one draw each"
+    np.testing.assert_array_equal(acted[:, 1], [parameters.item() for parameters in drawn])
 
 
 def force_action(model, k):
     """Make the discrete policy (and its target) draw the codeword of an action."""
     for actor in (model.actor, model.actor_target):
         codewords = actor.codebook.codewords.detach()
-        actor.discrete_policy.sample = lambda features, noise=None, c=codewords: c[k].expand(len(features), -1).clone()
+        actor.discrete_policy.sample = lambda features, c=codewords, **_: c[k].expand(len(features), -1).clone()
 
 
 def test_critic_target():
@@ -180,7 +206,7 @@ def test_critic_target():
     data = batch_of(model)
     data = data._replace(dones=(th.arange(32)[:, None] % 2).float())
     force_action(model, 1)
-    model.actor_target.continuous_policy.sample = lambda condition, noise=None, mask=None: th.full((len(condition), 1), 0.3)
+    model.actor_target.continuous_policy.sample = lambda condition, mask=None, noise=None: th.full((len(condition), 1), 0.3)
     latents = model.actor_target.codebook.codewords[1].expand(32, -1)
     with th.no_grad():
         q1, q2 = model.critic_target.q_values(data.next_observations, latents, th.full((32, 1), 0.3))
@@ -249,12 +275,24 @@ def test_relabelling_of_latents():
     assert (model.actor.codebook.quantize(data.latents) == data.discrete_actions).all(), "random actions decode to themselves"
     with th.no_grad():
         model.actor.codebook.codewords.copy_(-model.actor.codebook.codewords)
-    relabelled, drift = losses.relabel_latents(model.policy, data, True)
+    relabelled, drift = losses.relabel_latents(model.policy, data)
     assert 0 < drift <= 1
     assert (model.actor.codebook.quantize(relabelled.latents) == data.discrete_actions).all()
     unchanged = model.actor.codebook.quantize(data.latents) == data.discrete_actions
     assert (relabelled.latents[unchanged] == data.latents[unchanged]).all()
-    assert (losses.relabel_latents(model.policy, data, False)[0].latents == data.latents).all()
+
+
+def test_the_paper_keeps_stored_latents():
+    model = filled_model(algorithm_class=PaperCHDP)
+    before = model._sample_batch(64)
+    with th.no_grad():
+        model.actor.codebook.codewords.copy_(-model.actor.codebook.codewords)
+    after, drift = model._latents_of_today(before)
+    assert 0 < drift <= 1 and (after.latents == before.latents).all()
+    model.learning_rate = 0.0
+    model._setup_lr_schedule()
+    model.train(1, 32)
+    assert 0 < model.logger.name_to_value["train/latent_drift"] <= 1
 
 
 @pytest.mark.parametrize("episode_end, bootstraps", [("truncated", True), ("terminated", False)])
@@ -282,21 +320,26 @@ def test_two_seeded_runs_are_identical():
 
 
 @pytest.mark.parametrize(
-    "kwargs", [dict(diffusion=False), dict(codebook=False), dict(sequential_update=False),
-               dict(codebook=False, sequential_update=False), dict(improvement_q="min"), dict(improvement_q="mean"),
-               dict(variance_type="fixed_small", beta_schedule="cosine"), dict(n_action_candidates=1),
-               dict(improvement_parameters="stored", uniform_fraction=0), dict(n_target_candidates=4, n_random_candidates=4),
-               dict(n_refinement_candidates=4), dict(prioritized_replay=True),
+    "kwargs", [dict(n_action_candidates=1), dict(uniform_fraction=0), dict(n_target_candidates=4, n_random_candidates=4),
+               dict(n_refinement_candidates=4), dict(replay_buffer_class=PrioritizedReplayBuffer),
                dict(max_grad_norm=None), dict(policy_kwargs=dict(whitening=True)),
                dict(policy_kwargs=dict(layer_norm=True, parameter_degree=3, bilinear=True)),
                dict(codebook_lr_factor=1.0, critics_train_codebook=True), dict(n_diffusion_steps=1), dict(uniform_fraction=1)],
     ids=str,
 )  # fmt: skip
-def test_ablations_and_options_run(kwargs, tmp_path):
-    model = CHDP("MlpPolicy", HybridIdentityEnv(), **{**FAST_CHDP, **kwargs}).learn(40)
+def test_options_run(kwargs, tmp_path):
+    check_that_it_runs(CHDP, {**FAST_CHDP, **kwargs}, tmp_path)
+
+
+def test_the_paper_runs(tmp_path):
+    check_that_it_runs(PaperCHDP, PAPER_FAST, tmp_path)
+
+
+def check_that_it_runs(algorithm_class, kwargs, tmp_path):
+    model = algorithm_class("MlpPolicy", HybridIdentityEnv(), **kwargs).learn(40)
     assert model._n_updates == 20
     model.save(tmp_path / "model")
-    loaded = CHDP.load(tmp_path / "model", env=HybridIdentityEnv())
+    loaded = algorithm_class.load(tmp_path / "model", env=HybridIdentityEnv())
     obs = np.random.uniform(-1, 1, (5, 4)).astype(np.float32)
     np.testing.assert_array_equal(
         model.policy.predict_rows(obs, deterministic=True), loaded.policy.predict_rows(obs, deterministic=True)

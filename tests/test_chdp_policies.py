@@ -119,9 +119,8 @@ def test_action_noise_spares_padding_and_is_clipped():
     assert not data.parameters[~mask].any() and data.parameters.abs().max() <= 1
 
 
-@pytest.mark.parametrize("diffusion", [True, False])
-def test_deterministic_predictions_repeat(diffusion):
-    model = filled_model(diffusion=diffusion)
+def test_deterministic_predictions_repeat():
+    model = filled_model()
     obs = np.random.uniform(-1, 1, (5, 4)).astype(np.float32)
     first = model.policy.predict_rows(obs, deterministic=True)
     np.testing.assert_array_equal(model.policy.predict_rows(obs, deterministic=True), first)
@@ -197,20 +196,21 @@ def test_deterministic_actions_are_refined():
     """Variations of the best action come nearer to the best parameters; the discrete action and padding stay."""
     parameters = spaces.Tuple((box(-1, 1, 1), box(-1, 1, 2)))
     model = filled_model(LayoutEnv(spaces.Tuple((spaces.Discrete(2), parameters))))
-    spec = model.hybrid_space.spec
+    spec, columns = model.hybrid_space.spec, model.hybrid_space.columns
     assert not spec.mask.all()
     model.critic_target.q_values = lambda features, latents, parameters: (-(parameters[:, :1] - 0.7).abs(),) * 2
     obs = np.random.uniform(-1, 1, (50, 2)).astype(np.float32)
     errors = {}
     for model.policy.n_refinement_candidates, deterministic in itertools.product((0, 32), (False, True)):
         rows = model.policy.predict_rows(obs, deterministic)
-        k, parameters = rows[:, 0].astype(int), rows[:, 1 : spec.row_size]
+        k, parameters = columns.discrete_actions(rows), columns.view(rows, "parameters")
         errors[model.policy.n_refinement_candidates, deterministic] = np.abs(parameters[:, 0] - 0.7).mean()
-        assert (model.actor.codebook.quantize(th.as_tensor(rows[:, spec.row_size :])).numpy() == k).all()
+        assert (model.actor.codebook.quantize(th.as_tensor(columns.view(rows, "latents"))).numpy() == k).all()
         assert (parameters[~spec.mask[k].astype(bool)] == 0).all()
         assert np.abs(parameters).max() <= 1
         assert (rows == model.policy.predict_rows(obs, deterministic)).all() == deterministic
-    assert errors[32, True] < 0.7 * errors[0, True]
+    # Of 32 variations with a standard deviation of 0.1 the best is about 0.2 nearer
+    assert errors[32, True] < errors[0, True] - 0.15
     assert errors[32, False] > 0.7 * errors[0, False]
     assert model.policy._get_constructor_parameters()["n_refinement_candidates"] == 32
 

@@ -7,87 +7,98 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_chdp.chdp.denoising import denoise
-from sb3_chdp.chdp.diffusion import DeterministicModel, DiffusionModel, NoiseSchedule, cosine_beta_schedule
+from sb3_chdp.chdp.diffusion import DiffusionModel, NoiseSchedule
 
 
-def test_vp_schedule_by_hand():
-    # N = 2, b_min 0.1, b_max 10: beta_i = 1 - exp(-0.05 - 4.95 (2i - 1) / 4)
+def betas_of(n_steps):
+    """:return: (N,) beta_i of the variance preserving process, with b_min 0.1 and b_max 10"""
+    i = np.arange(1, n_steps + 1)
+    return 1 - np.exp(-0.1 / n_steps - 0.5 * 9.9 * (2 * i - 1) / n_steps**2)
+
+
+def test_schedule_by_hand():
+    # N = 2: beta_i = 1 - exp(-0.05 - 4.95 (2i - 1) / 4)
     schedule = NoiseSchedule(2)
     beta_1, beta_2 = 1 - np.exp(-0.05 - 1.2375), 1 - np.exp(-0.05 - 3.7125)
-    np.testing.assert_allclose(schedule.betas, [beta_1, beta_2], rtol=1e-12)
-    np.testing.assert_allclose(schedule.betas, [0.7240397, 0.9767742], rtol=1e-6)
+    np.testing.assert_allclose([beta_1, beta_2], [0.7240397, 0.9767742], rtol=1e-6)
+    np.testing.assert_allclose([beta_1, beta_2], betas_of(2), rtol=1e-12)
+    np.testing.assert_allclose(schedule.sigma, np.sqrt([beta_1, beta_2]), rtol=1e-12)
     abar_1, abar_2 = 1 - beta_1, (1 - beta_1) * (1 - beta_2)
-    np.testing.assert_allclose(schedule.alphas_cumprod, [abar_1, abar_2])
+    np.testing.assert_allclose(schedule.signal, np.sqrt([abar_1, abar_2]))
+    np.testing.assert_allclose(schedule.spread, np.sqrt([1 - abar_1, 1 - abar_2]))
     # The first step has no noise before it: its posterior is x_0 itself
-    np.testing.assert_allclose(schedule.posterior_mean_coef1, [1.0, beta_2 * np.sqrt(abar_1) / (1 - abar_2)])
-    np.testing.assert_allclose(schedule.posterior_mean_coef2, [0.0, (1 - abar_1) * np.sqrt(1 - beta_2) / (1 - abar_2)])
-    np.testing.assert_allclose(schedule.sigmas, np.sqrt([beta_1, beta_2]))
-    small = NoiseSchedule(2, variance_type="fixed_small")
-    np.testing.assert_allclose(small.sigmas, [0.0, np.sqrt(beta_2 * (1 - abar_1) / (1 - abar_2))])
+    np.testing.assert_allclose(schedule.mean_start, [1.0, beta_2 * np.sqrt(abar_1) / (1 - abar_2)])
+    np.testing.assert_allclose(schedule.mean_x, [0.0, (1 - abar_1) * np.sqrt(1 - beta_2) / (1 - abar_2)])
 
 
-def test_other_schedules():
-    np.testing.assert_allclose(NoiseSchedule(3, "linear").betas, [1e-4, 0.01005, 0.02])
-    # Remaining signal of the cosine schedule at half time: cos^2((0.5 + s) / (1 + s) pi / 2) / cos^2(s / (1 + s) pi / 2)
-    s = 0.008
-    half = np.prod(1 - cosine_beta_schedule(10)[:5])
-    expected = (np.cos((0.5 + s) / (1 + s) * np.pi / 2) / np.cos(s / (1 + s) * np.pi / 2)) ** 2
-    assert half == pytest.approx(expected)
+class KnownNoise(nn.Module):
+    """Predicts what :meth:`DiffusionModel.sample` ought to take away: a function of x_i and the step, given as a tensor."""
 
+    def __init__(self, predict, n_steps):
+        super().__init__()
+        self.predict, self.n_steps = predict, n_steps
 
-@pytest.mark.parametrize(
-    "kwargs, message", [({"n_steps": 0}, "n_diffusion_steps"), ({"n_steps": 3, "beta_schedule": "sine"}, "beta_schedule")]
-)
-def test_bad_arguments(kwargs, message):
-    with pytest.raises(ValueError, match=message):
-        NoiseSchedule(**kwargs)
-    with pytest.raises(ValueError, match="variance_type"):
-        NoiseSchedule(3, variance_type="learned")
+    def contexts(self, condition):
+        return th.zeros(len(condition), 1), th.arange(self.n_steps)[:, None]
+
+    def forward(self, x, context):
+        return self.predict(x, int(context[0]))
 
 
 def test_reverse_step_equals_the_papers():
-    """Without clipping, the mean through x_0 is (x - (1 - alpha) / sqrt(1 - abar) eps) / sqrt(alpha)."""
-    schedule = NoiseSchedule(5)
-    for i in range(5):
-        noise = 0.1 * th.randn(64, 4)
-        x = schedule.sqrt_alphas_cumprod[i] * (th.rand(64, 4) - 0.5) + schedule.sqrt_one_minus_alphas_cumprod[i] * noise
-        alpha = 1 - schedule.betas[i]
-        expected = (x - (1 - alpha) / schedule.sqrt_one_minus_alphas_cumprod[i] * noise) / alpha**0.5
-        mean = denoise([schedule.steps[i]], x[None], None, lambda x, i, noise=noise: noise)
-        th.testing.assert_close(mean, expected, atol=2e-5, rtol=1e-4)
+    """Where nothing is clipped, x_{i-1} = (x_i - beta_i / sqrt(1 - abar_i) eps) / sqrt(alpha_i) + sqrt(beta_i) z."""
+    n_steps, betas = 5, betas_of(5)
+    abar = np.cumprod(1 - betas)
+    model, seen = DiffusionModel(4, 1, n_steps, [4]), []
+
+    def predict(x, i):
+        # The noise that stands for an x_0 well inside [-1, 1]
+        eps = (x - abar[i] ** 0.5 * 0.1 * th.tanh(x)) / (1 - abar[i]) ** 0.5
+        seen.append((i, x, eps))
+        return eps
+
+    model.noise_predictor = KnownNoise(predict, n_steps)
+    noise = th.randn(n_steps, 64, 4)
+    x_0 = model.sample(th.zeros(64, 1), noise=noise)
+    assert [i for i, *_ in seen] == [4, 3, 2, 1, 0] and (seen[0][1] == noise[0]).all()
+    samples = [x for _, x, _ in seen[1:]] + [x_0]
+    for (i, x, eps), after in zip(seen, samples, strict=True):
+        expected = (x - betas[i] / (1 - abar[i]) ** 0.5 * eps) / (1 - betas[i]) ** 0.5
+        if i > 0:
+            expected = expected + betas[i] ** 0.5 * noise[n_steps - i]
+        th.testing.assert_close(after, expected.float(), atol=2e-5, rtol=1e-4)
 
 
-class OptimalPredictor(th.nn.Module):
-    """The exact noise predictor of data that are Gaussian with the given mean and standard deviation."""
-
-    def __init__(self, schedule, mean, std):
-        super().__init__()
-        self.schedule, self.mean, self.std = schedule, mean, std
-
-    def for_chain(self, condition):
-        return self
-
-    def forward(self, x, i):
-        abar = self.schedule.alphas_cumprod[i]
-        variance = abar * self.std**2 + 1 - abar
-        return (1 - abar) ** 0.5 * (x - abar**0.5 * self.mean) / variance
+def test_samples_are_in_the_box():
+    """However far off the predicted noise is."""
+    model = DiffusionModel(3, 2, 5, [16])
+    with th.no_grad():
+        for parameter in model.parameters():
+            parameter.mul_(20)
+    x = model.sample(5 * th.randn(100, 2))
+    assert x.abs().max() <= 1
 
 
-@pytest.mark.parametrize("variance_type", ["fixed_small", "fixed_large"])
-def test_chain_with_a_linear_denoiser_gives_the_analytic_gaussian(variance_type):
+def test_chain_with_a_linear_denoiser_gives_the_analytic_gaussian():
+    """With the exact noise predictor of Gaussian data every step is affine in x: mean and variance follow by hand."""
     mean, std, n_steps = 0.2, 0.1, 15
-    model = DiffusionModel(1, 1, n_steps, [4], variance_type=variance_type)
-    model.noise_predictor = OptimalPredictor(model.schedule, mean, std)
+    betas = betas_of(n_steps)
+    abar = np.cumprod(1 - betas)
+
+    def predict(x, i):
+        variance = abar[i] * std**2 + 1 - abar[i]
+        return (1 - abar[i]) ** 0.5 * (x - abar[i] ** 0.5 * mean) / variance
+
+    model = DiffusionModel(1, 1, n_steps, [4])
+    model.noise_predictor = KnownNoise(predict, n_steps)
     th.manual_seed(0)
-    # Every step is affine in x: propagate mean and variance by hand
-    schedule, m, v = model.schedule, 0.0, 1.0
+    m, v = 0.0, 1.0
     for i in reversed(range(n_steps)):
-        abar, alpha = schedule.alphas_cumprod[i], 1 - schedule.betas[i]
-        gain = (1 - abar) / (abar * std**2 + 1 - abar)  # eps = gain / sqrt(1 - abar) (x - sqrt(abar) mean)
-        a = (1 - (1 - alpha) / (1 - abar) * gain) / alpha**0.5
-        b = (1 - alpha) / (1 - abar) * gain * abar**0.5 * mean / alpha**0.5
-        m, v = a * m + b, a * a * v + (schedule.sigmas[i] ** 2 if i > 0 else 0.0)
+        alpha = 1 - betas[i]
+        gain = (1 - abar[i]) / (abar[i] * std**2 + 1 - abar[i])  # eps = gain / sqrt(1 - abar) (x - sqrt(abar) mean)
+        a = (1 - (1 - alpha) / (1 - abar[i]) * gain) / alpha**0.5
+        b = (1 - alpha) / (1 - abar[i]) * gain * abar[i] ** 0.5 * mean / alpha**0.5
+        m, v = a * m + b, a * a * v + (betas[i] if i > 0 else 0.0)
     with th.no_grad():
         x = model.sample(th.zeros(40_000, 1))
     assert x.mean().item() == pytest.approx(m, abs=4e-3)
@@ -99,7 +110,7 @@ def test_chain_with_a_linear_denoiser_gives_the_analytic_gaussian(variance_type)
 def test_diffusion_loss_alone_recovers_two_modes():
     """Given condition +1 the data lie at -0.6 and +0.6, given -1 at 0 only."""
     th.manual_seed(0)
-    model = DiffusionModel(1, 1, 15, [64, 64], variance_type="fixed_small")
+    model = DiffusionModel(1, 1, 15, [64, 64])
     optimizer = th.optim.Adam(model.parameters(), lr=2e-3)
     for _ in range(3000):
         condition = th.randint(2, (256, 1)).float() * 2 - 1
@@ -117,59 +128,42 @@ def test_diffusion_loss_alone_recovers_two_modes():
     assert (one.abs() < 0.2).float().mean() > 0.9
 
 
-def test_time_and_condition_change_the_prediction():
-    model = DiffusionModel(3, 2, 4, [16, 16])
-    predictor, x = model.noise_predictor, th.randn(5, 3)
-    context = predictor.condition_context(th.randn(5, 2))
-    outputs = [predictor(x, context + time) for time in predictor.time_context()]
+def test_step_and_condition_change_the_prediction():
+    predictor, x = DiffusionModel(3, 2, 4, [16, 16]).noise_predictor, th.randn(5, 3)
+    by_condition, by_step = predictor.contexts(th.randn(5, 2))
+    outputs = [predictor(x, by_condition + step) for step in by_step]
     assert all((a - b).abs().max() > 1e-5 for a, b in itertools.pairwise(outputs))
-    assert (predictor(x, context) - predictor(x, 0 * context)).abs().max() > 1e-5
+    assert (outputs[0] - predictor(x, by_step[0].expand(5, -1))).abs().max() > 1e-5
 
 
 def test_split_first_layer_equals_the_layer_on_the_concatenation():
-    model = DiffusionModel(3, 2, 4, [16, 16])
-    predictor, x, condition, i = model.noise_predictor, th.randn(5, 3), th.randn(5, 2), 2
-    embedding = predictor.time_mlp(predictor.sinusoids)[i].expand(5, -1)
-    weight = th.cat([predictor.x_weight, predictor.time_weight, predictor.condition_weight], dim=1)
-    hidden = th.cat([x, embedding, condition], dim=1) @ weight.t() + predictor.bias
-    actual = predictor(x, predictor.condition_context(condition) + predictor.time_context()[i])
-    th.testing.assert_close(actual, predictor.trunk(hidden))
+    predictor, x, condition = DiffusionModel(3, 2, 4, [16, 16]).noise_predictor, th.randn(5, 3), th.randn(5, 2)
+    embedding = predictor.time_mlp(predictor.sinusoids)[2].expand(5, -1)
+    hidden = predictor.first_layer(th.cat([x, embedding, condition], dim=1))
+    by_condition, by_step = predictor.contexts(condition)
+    th.testing.assert_close(predictor(x, by_condition + by_step[2]), predictor.trunk(hidden))
 
 
-@pytest.mark.parametrize("net_arch", [[16], [16, 8], [8, 16, 8]], ids=str)
-@pytest.mark.parametrize("activation_fn", [nn.SiLU, nn.ReLU, nn.Tanh, nn.Mish])
 @pytest.mark.parametrize("masked", [False, True])
-def test_written_out_gradients_equal_autograd(net_arch, activation_fn, masked):
-    model = DiffusionModel(3, 2, 6, net_arch, activation_fn)
-    predictor, schedule = model.noise_predictor, model.schedule
-    condition, noise = th.randn(20, 2, requires_grad=True), model.draw_noise(20)
-    mask = (th.rand(20, 3) < 0.6).float() if masked else None
-    context, times = predictor.condition_context(condition), predictor.time_context()
-    x = noise[0]
-    for i in reversed(range(6)):
-        x = x if mask is None else x * mask
-        abar, coefficients = schedule.alphas_cumprod[i], (schedule.posterior_mean_coef1[i], schedule.posterior_mean_coef2[i])
-        x_start = ((x - (1 - abar) ** 0.5 * predictor(x, context + times[i])) / abar**0.5).clamp(-1, 1)
-        x = coefficients[0] * x_start + coefficients[1] * x
-        x = x + schedule.sigmas[i] * noise[i] if i > 0 else x
-    plain = x.clamp(-1, 1) if mask is None else x.clamp(-1, 1) * mask
-    fast = model.sample(condition, noise, mask)
-    th.testing.assert_close(fast, plain, atol=1e-5, rtol=0)
-    with th.no_grad():
-        th.testing.assert_close(model.sample(condition, noise, mask), plain, atol=1e-5, rtol=0)
-    inputs, weights = [condition, *model.parameters()], th.randn(20, 3)
-    for mine, theirs in zip(*(th.autograd.grad((s * weights).sum(), inputs) for s in (fast, plain)), strict=True):
-        th.testing.assert_close(mine, theirs, atol=1e-4, rtol=1e-3)
+def test_gradients_flow_through_the_whole_chain(masked):
+    """Those of the condition against finite differences, and every parameter gets one."""
+    th.manual_seed(0)
+    model = DiffusionModel(3, 2, 6, [8], nn.Tanh).double()
+    noise, mask = 0.3 * th.randn(6, 4, 3).double(), th.tensor([[1.0, 0.0, 1.0]]).double() if masked else None
+    condition = th.randn(4, 2).double().requires_grad_()
+    assert th.autograd.gradcheck(lambda c: model.sample(c, mask, noise), (condition,))
+    gradients = th.autograd.grad(model.sample(condition, mask, noise).square().sum(), list(model.parameters()))
+    assert all(gradient.abs().max() > 0 for gradient in gradients)
 
 
 def test_padding_never_matters():
     """Values in padded entries change neither the sample nor the loss, and padded entries come out as 0."""
     model = DiffusionModel(3, 2, 5, [16])
     condition, mask = th.randn(6, 2), th.tensor([[1.0, 1.0, 0.0]]).expand(6, 3)
-    noise = model.draw_noise(6)
+    noise = th.randn(5, 6, 3)
     changed = noise.clone()
     changed[..., 2] += 5.0
-    first, second = model.sample(condition, noise, mask), model.sample(condition, changed, mask)
+    first, second = model.sample(condition, mask, noise), model.sample(condition, mask, changed)
     assert (first == second).all() and not first[:, 2].any()
     x = th.rand(6, 3) * 2 - 1
     other = x.clone()
@@ -181,10 +175,22 @@ def test_padding_never_matters():
     assert losses[0] == losses[1]
 
 
-def test_deterministic_model():
-    model = DeterministicModel(2, 3, [8], exploration_noise=0.5)
-    condition = th.randn(7, 3)
-    quiet = model.draw_noise(7, th.Generator())
-    assert (model.sample(condition, quiet) == model.mlp(condition)).all()
-    assert (model.sample(condition) != model.sample(condition)).any()
-    assert model.diffusion_loss(th.zeros(7, 2), condition) == 0
+def test_diffusion_loss_is_the_error_of_the_predicted_noise():
+    """Without its noise, x_i = signal x_0: a predictor that knows x_0 has no loss, one that says 0 has a loss of 1."""
+    model = DiffusionModel(2, 1, 5, [4])
+    x_start = (th.rand(4000, 2) * 2 - 1) * 0.5
+    abar = np.cumprod(1 - betas_of(5))
+    seen = []
+
+    class Exact(KnownNoise):
+        def forward(self, x, context):
+            seen.append(context[:, 0].long())
+            signal = th.as_tensor(abar, dtype=th.float32)[context[:, 0].long(), None]
+            return (x - signal.sqrt() * x_start) / (1 - signal).sqrt()
+
+    model.noise_predictor = Exact(None, 5)
+    assert model.diffusion_loss(x_start, th.zeros(4000, 1)) < 1e-9
+    # Every step is as likely
+    assert th.bincount(seen[0], minlength=5).min() > 700
+    model.noise_predictor = KnownNoise(lambda x, i: th.zeros_like(x), 5)
+    assert model.diffusion_loss(x_start, th.zeros(4000, 1)).item() == pytest.approx(1, abs=0.1)

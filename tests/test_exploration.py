@@ -31,22 +31,22 @@ def test_each_part_is_varied():
     """Of four kinds of exploratory actions, two keep the discrete action, and one of these stays near its parameters."""
     model = filled_model(make_layout_env("nested"))
     spec = model.hybrid_space.spec
-    n, columns = 4000, slice(1, spec.row_size)
+    n, columns = 4000, model.hybrid_space.columns
     obs = np.random.default_rng(0).uniform(-1, 1, (n, 2)).astype(np.float32)
     rows = model.policy.predict_rows(obs)
     varied = vary_parts(model.policy, obs, rows, np.random.default_rng(0))
 
     assert set(varied[:, 0]) == {0, 1, 2}
     assert np.abs(varied[:, 1:]).max() <= 1
-    assert not varied[:, columns][~spec.mask[varied[:, 0].astype(int)].astype(bool)].any()
-    decoded = model.actor.codebook.quantize(th.as_tensor(varied[:, spec.row_size :]))
+    assert not columns.view(varied, "parameters")[~spec.mask[varied[:, 0].astype(int)].astype(bool)].any()
+    decoded = model.actor.codebook.quantize(th.as_tensor(columns.view(varied, "latents")))
     assert (decoded.numpy() == varied[:, 0]).mean() > 0.97
 
-    kept = (varied[:, spec.row_size :] == rows[:, spec.row_size :]).all(axis=1)
+    kept = (columns.view(varied, "latents") == columns.view(rows, "latents")).all(axis=1)
     assert kept.mean() == pytest.approx(0.5, abs=0.05)
     assert (varied[kept, 0] == rows[kept, 0]).all()
     two_parameters = kept & (rows[:, 0] == 0)
-    near = np.abs(varied - rows)[two_parameters, columns].max(axis=1) < 0.1
+    near = np.abs(columns.view(varied - rows, "parameters"))[two_parameters].max(axis=1) < 0.1
     assert 0.1 < near.mean() < 0.4
 
 

@@ -252,8 +252,7 @@ def test_unbounded_parameters(algorithm):
 
 @pytest.mark.parametrize(
     "kwargs, name",
-    [(dict(improvement_q="max"), "improvement_q"), (dict(improvement_parameters="x"), "improvement_parameters"),
-     (dict(uniform_fraction=1.5), "uniform_fraction"), (dict(beta_schedule="x"), "beta_schedule"),
+    [(dict(uniform_fraction=1.5), "uniform_fraction"), (dict(policy_delay=0), "policy_delay"),
      (dict(n_diffusion_steps=0), "n_diffusion_steps"), (dict(latent_dim=0), "latent_dim"),
      (dict(n_random_candidates=-1), "n_random_candidates"), (dict(n_refinement_candidates=-1), "n_refinement_candidates")],
 )  # fmt: skip

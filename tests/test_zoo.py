@@ -1,6 +1,7 @@
 """The command line, really run on tiny budgets."""
 
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_chdp import ALGORITHMS
 from sb3_chdp.cli import SCRIPTS
+from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.envs import ENV_IDS
 
 pytest.importorskip("rl_zoo3")
@@ -127,6 +129,12 @@ def test_users_own_hyperparameters_win(trained):
     (trained / "own.yml").write_text("default:\n  n_timesteps: 40\n  policy: MlpPolicy\n  latent_dim: 5\n")
     output = run("train", "--env", ENV_ID, "-conf", "own.yml", "--eval-freq", "-1", "-f", "own", cwd=trained)
     assert "latent_dim" in output
+
+
+def test_the_yaml_file_names_the_replay_buffer(tmp_path):
+    run("train", "--env", "Goal-v0", "-n", "100", "--eval-freq", "-1", "--save-replay-buffer", *TINY, cwd=tmp_path)
+    with (tmp_path / "logs" / "chdp" / "Goal-v0_1" / "replay_buffer.pkl").open("rb") as file:
+        assert isinstance(pickle.load(file), PrioritizedReplayBuffer)
 
 
 def test_stock_algorithm_on_the_flattened_environment(trained):

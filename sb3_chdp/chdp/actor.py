@@ -1,13 +1,15 @@
 """The two cooperating policies of CHDP with the codebook between them."""
 
+from typing import Any
+
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_chdp.chdp.codebook import Codebook, OneHotCodebook
-from sb3_chdp.chdp.diffusion import DeterministicModel, DiffusionModel
+from sb3_chdp.chdp.codebook import Codebook
+from sb3_chdp.chdp.diffusion import DiffusionModel
 from sb3_chdp.common.hybrid_box import HybridBox
 
 
@@ -32,12 +34,12 @@ class CooperativeActor(BaseModel):
 
     def __init__(
         self,
-        observation_space: spaces.Space,
+        observation_space: spaces.Space[Any],
         action_space: HybridBox,
         features_extractor: BaseFeaturesExtractor,
-        codebook: Codebook | OneHotCodebook,
-        discrete_policy: DiffusionModel | DeterministicModel,
-        continuous_policy: DiffusionModel | DeterministicModel,
+        codebook: Codebook,
+        discrete_policy: DiffusionModel,
+        continuous_policy: DiffusionModel,
         normalize_images: bool = True,
     ):
         super().__init__(
@@ -67,7 +69,7 @@ class CooperativeActor(BaseModel):
         :param noise: noise of the discrete policy's chain, drawn if None
         :return: latents (B, latent_dim) and the discrete actions (B,) that they decode to
         """
-        latents = self.discrete_policy.sample(features, noise)
+        latents = self.discrete_policy.sample(features, noise=noise)
         return latents, self.codebook.quantize(latents)
 
     def sample_parameters(self, features: th.Tensor, k: th.Tensor, noise: th.Tensor | None = None) -> th.Tensor:
@@ -78,7 +80,7 @@ class CooperativeActor(BaseModel):
         :return: (B, Pmax) parameters in [-1, 1], padding 0; their gradient reaches the codewords of k
         """
         condition = th.cat([features, self.codebook(k)], dim=1)
-        return self.continuous_policy.sample(condition, noise, self.mask(k))
+        return self.continuous_policy.sample(condition, self.mask(k), noise)
 
     def random_actions(self, *shape: int, generator: th.Generator | None = None) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """

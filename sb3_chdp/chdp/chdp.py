@@ -4,7 +4,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
@@ -15,19 +14,13 @@ from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.codebook import codebook_usage
 from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.exploration import vary_parts
-from sb3_chdp.chdp.losses import (
-    IMPROVEMENT_PARAMETERS,
-    IMPROVEMENT_QS,
-    continuous_policy_loss,
-    critic_loss,
-    discrete_policy_loss,
-    relabel_latents,
-)
+from sb3_chdp.chdp.losses import continuous_policy_loss, critic_loss, discrete_policy_loss, relabel_latents
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
-from sb3_chdp.common.buffers import PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
-from sb3_chdp.common.checks import check_at_least, check_fraction, check_one_of
+from sb3_chdp.common.buffers import PrioritizedReplayBuffer
+from sb3_chdp.common.checks import check_at_least, check_fraction
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
+from sb3_chdp.common.samples import HybridReplaySamples
 from sb3_chdp.common.utils import TargetUpdate, gradient_step
 
 
@@ -42,21 +35,20 @@ class CHDP(HybridOffPolicyAlgorithm):
     Paper: Liu et al., "CHDP: Cooperative Hybrid Diffusion Policies for Reinforcement Learning in Parameterized Action
     Space", AAAI 2026. No reference code is published.
 
-    Differences from the paper:
-        1. the action of highest Q among ``n_action_candidates`` draws acts (1: the paper), see also ``n_random_candidates``
-           and ``n_refinement_candidates``;
-        2. random actions with a decreasing probability, see ``exploration_initial_eps`` (0: the paper) and ``explore_parts``;
+    :class:`PaperCHDP` is the algorithm as published. Differences from it:
+        1. the action of highest Q among ``n_action_candidates`` draws acts, see also ``n_random_candidates`` and
+           ``n_refinement_candidates``;
+        2. random actions with a decreasing probability, see ``exploration_initial_eps`` and ``explore_parts``;
         3. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
-           stored ones, see ``improvement_parameters`` ("stored": the paper);
+           stored ones;
         4. the continuous policy is improved for uniformly random discrete actions too, some of which are among the
-           candidates, see ``uniform_fraction`` (0: the paper);
-        5. latents from the buffer that no longer decode to the action taken are replaced, see ``relabel_latents``;
-        6. gradient norms are clipped, see ``max_grad_norm``;
-        7. the critics' loss can train the codebook, which makes many discrete actions learnable, see
-           ``critics_train_codebook`` (False: the paper);
-        8. transitions of large TD error can be replayed more often, see ``prioritized_replay`` (False: the paper);
-        9. codewords are kept in [-1, 1], where the latents are (not an argument: without it they drift away, and latents
-           can no longer reach them).
+           candidates, see ``uniform_fraction``;
+        5. latents from the buffer that no longer decode to the action taken give way to its present codeword, see
+           ``train/latent_drift``;
+        6. the critics' loss can train the codebook, which makes many discrete actions learnable, see
+           ``critics_train_codebook``;
+        7. transitions of large TD error can be replayed more often, with
+           ``replay_buffer_class=``:class:`PrioritizedReplayBuffer`.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str), with a hybrid action space
@@ -75,12 +67,7 @@ class CHDP(HybridOffPolicyAlgorithm):
     :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the critics.
     :param latent_dim: width d_e of the latent and of a codeword
     :param n_diffusion_steps: number N of denoising steps of both policies
-    :param beta_schedule: noise schedule, "vp", "linear" or "cosine"
-    :param variance_type: variance of a denoising step, "fixed_large" (the paper) or "fixed_small" (DDPM's posterior)
     :param eta: weight of the policy improvement terms relative to the diffusion losses
-    :param improvement_q: which Q the policies ascend: "q1", "min" or "mean" of the two
-    :param improvement_parameters: parameters that value the discrete policy's latents: "stored", those of the action once
-        taken, or "policy", those that the continuous policy draws for the latents
     :param uniform_fraction: share of uniformly random discrete actions for which the continuous policy is improved, and of
         those among the candidates
     :param n_action_candidates: number of actions drawn per observation to act; that of highest target min(Q1, Q2) is taken
@@ -90,20 +77,12 @@ class CHDP(HybridOffPolicyAlgorithm):
         predictions, in each of two rounds, see :class:`CHDPPolicy`: for parameters that have to be exact (0: the paper)
     :param n_target_candidates: number of next actions drawn per transition for the target of the critics, chosen from in
         the same way (1: the paper)
-    :param prioritized_replay: whether transitions of large TD error are replayed more often, see
-        :class:`PrioritizedReplayBuffer`, whose arguments ``replay_buffer_kwargs`` can hold (False: the paper)
-    :param relabel_latents: whether stored latents that no longer decode to their action give way to its present codeword
     :param codebook_lr_factor: learning rate of the codebook relative to that of the networks; the faster it moves, the
         more stored latents decode to other actions (``train/latent_drift``)
     :param critics_train_codebook: whether the critics' loss trains the codebook too, so that actions of similar effect get
         similar codewords; best with ``codebook_lr_factor=1`` (no effect without a codebook)
     :param max_grad_norm: bound on the gradient norm of every network, None for none
     :param policy_delay: policies and targets are updated once every ``policy_delay`` critic updates
-    :param diffusion: False replaces both diffusion policies by deterministic MLPs (ablation)
-    :param codebook: False replaces the codebook by argmax over a latent of width K and one-hot vectors (ablation)
-    :param sequential_update: False updates the continuous policy on the stored latents and actions instead of those of
-        the updated discrete policy (ablation)
-    :param exploration_noise: standard deviation of the exploration noise if ``diffusion`` is False
     :param action_layout: how to read an ambiguous action space, "auto", "per_action" or "shared",
         see :class:`HybridActionSpec`
     :param explore_parts: whether exploration also varies the discrete action or the parameters alone, see
@@ -150,26 +129,16 @@ class CHDP(HybridOffPolicyAlgorithm):
         n_steps: int = 1,
         latent_dim: int = 8,
         n_diffusion_steps: int = 15,
-        beta_schedule: str = "vp",
-        variance_type: str = "fixed_large",
         eta: float = 10.0,
-        improvement_q: str = "q1",
-        improvement_parameters: str = "policy",
         uniform_fraction: float = 0.25,
         n_action_candidates: int = 16,
         n_random_candidates: int = 0,
         n_refinement_candidates: int = 0,
         n_target_candidates: int = 1,
-        prioritized_replay: bool = False,
-        relabel_latents: bool = True,
         codebook_lr_factor: float = 0.1,
         critics_train_codebook: bool = False,
         max_grad_norm: float | None = 1.0,
         policy_delay: int = 1,
-        diffusion: bool = True,
-        codebook: bool = True,
-        sequential_update: bool = True,
-        exploration_noise: float = 0.1,
         action_layout: str = "auto",
         explore_parts: bool = False,
         exploration_fraction: float = 0.2,
@@ -210,38 +179,22 @@ class CHDP(HybridOffPolicyAlgorithm):
             seed=seed,
             device=device,
         )
-        check_one_of(IMPROVEMENT_QS, improvement_q=improvement_q)
-        check_one_of(IMPROVEMENT_PARAMETERS, improvement_parameters=improvement_parameters)
         check_fraction(uniform_fraction=uniform_fraction)
-        check_at_least(1, latent_dim=latent_dim, policy_delay=policy_delay)
+        check_at_least(1, latent_dim=latent_dim, n_diffusion_steps=n_diffusion_steps, policy_delay=policy_delay)
         check_at_least(1, n_action_candidates=n_action_candidates, n_target_candidates=n_target_candidates)
         check_at_least(0, n_random_candidates=n_random_candidates, n_refinement_candidates=n_refinement_candidates)
-        if prioritized_replay and (n_steps > 1 or replay_buffer_class is not None):
-            raise ValueError(
-                f"prioritized_replay=True needs n_steps=1 and no replay_buffer_class, got {n_steps} and {replay_buffer_class}"
-            )
         self.latent_dim = latent_dim
         self.n_diffusion_steps = n_diffusion_steps
-        self.beta_schedule = beta_schedule
-        self.variance_type = variance_type
         self.eta = eta
-        self.improvement_q = improvement_q
-        self.improvement_parameters = improvement_parameters
         self.uniform_fraction = uniform_fraction
         self.n_action_candidates = n_action_candidates
         self.n_random_candidates = n_random_candidates
         self.n_refinement_candidates = n_refinement_candidates
         self.n_target_candidates = n_target_candidates
-        self.prioritized_replay = prioritized_replay
-        self.relabel_latents = relabel_latents
         self.codebook_lr_factor = codebook_lr_factor
         self.critics_train_codebook = critics_train_codebook
         self.max_grad_norm = max_grad_norm
         self.policy_delay = policy_delay
-        self.diffusion = diffusion
-        self.codebook = codebook
-        self.sequential_update = sequential_update
-        self.exploration_noise = exploration_noise
         self.explore_parts = explore_parts
 
         if _init_setup_model:
@@ -249,27 +202,17 @@ class CHDP(HybridOffPolicyAlgorithm):
 
     def _network_kwargs(self) -> dict[str, Any]:
         return dict(
-            diffusion=self.diffusion,
-            codebook=self.codebook,
             n_diffusion_steps=self.n_diffusion_steps,
-            beta_schedule=self.beta_schedule,
-            variance_type=self.variance_type,
             n_action_candidates=self.n_action_candidates,
             n_random_candidates=self.n_random_candidates,
             n_refinement_candidates=self.n_refinement_candidates,
             uniform_fraction=self.uniform_fraction,
-            exploration_noise=self.exploration_noise,
         )
 
     def _make_hybrid_space(self) -> HybridBox:
-        box = super()._make_hybrid_space()
-        latent_dim = self.latent_dim if self.codebook else box.spec.n_discrete_actions
-        return HybridBox(self.action_space, self.action_layout, latent_dim)
+        return HybridBox(self.action_space, self.action_layout, self.latent_dim)
 
     def _setup_model(self) -> None:
-        if self.prioritized_replay:
-            with_dict = isinstance(self.observation_space, spaces.Dict)
-            self.replay_buffer_class = PrioritizedDictReplayBuffer if with_dict else PrioritizedReplayBuffer
         super()._setup_model()
         self._create_aliases()
         self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
@@ -285,45 +228,45 @@ class CHDP(HybridOffPolicyAlgorithm):
         self.policy.set_training_mode(True)
         policy = self.policy
         self._update_learning_rates()
-        codebook_optimizer = [] if policy.codebook_optimizer is None else [policy.codebook_optimizer]
+        critic_optimizers = [policy.critic.optimizer]
+        if self.critics_train_codebook:
+            critic_optimizers.append(policy.codebook_optimizer)
 
         logs: dict[str, list[th.Tensor]] = {}
         for _ in range(gradient_steps):
             self._n_updates += 1
-            replay_data, drift = relabel_latents(policy, self._sample_batch(batch_size), self.relabel_latents)
+            replay_data, drift = self._latents_of_today(self._sample_batch(batch_size))
 
-            # Step 0: critics, and the codebook if they train it
+            # Step 0: critics, eq. 10, and the codebook if they train it
             loss, q_values, errors = critic_loss(policy, replay_data, self.n_target_candidates)
+            gradient_step(loss, critic_optimizers, self.max_grad_norm)
+            policy.actor.codebook.project()
             if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
-                self.replay_buffer.update_priorities(errors)
-            also = codebook_optimizer if self.critics_train_codebook else []
-            gradient_step(loss, [policy.critic.optimizer, *also], self.max_grad_norm)
-            self.actor.codebook.project()
+                assert replay_data.indices is not None, "a prioritised buffer says where its samples are"
+                self.replay_buffer.update_priorities(replay_data.indices, errors)
             losses = {"critic_loss": loss, "q_mean": q_values.mean(), "latent_drift": drift}
 
             if self._n_updates % self.policy_delay == 0:
-                # alpha of eq. dql_q_loss
                 alpha = self.eta / q_values.abs().mean().clamp(min=1e-6)
-                actor_features = policy.actor_features(replay_data.observations)
+                features = policy.actor_features(replay_data.observations)
                 with th.no_grad():
                     critic_features = self.critic.features(replay_data.observations)
-                features = (actor_features, critic_features)
 
-                # Step 1: discrete policy
-                diffusion_loss, q_loss = discrete_policy_loss(
-                    policy, replay_data, *features, self.improvement_q, self.improvement_parameters
-                )
+                # Step 1: discrete policy, eq. 7
+                parameters = self._parameters_of_latents(replay_data)
+                diffusion_loss, q_loss = discrete_policy_loss(policy, replay_data, features, critic_features, parameters)
                 loss = diffusion_loss + alpha * q_loss
                 gradient_step(loss, [policy.discrete_optimizer], self.max_grad_norm)
                 losses |= {"discrete_loss": loss, "diffusion_loss_discrete": diffusion_loss}
 
-                # Step 2: continuous policy and codebook, given the updated discrete policy
-                diffusion_loss, q_loss, k = continuous_policy_loss(
-                    policy, replay_data, *features, self.improvement_q, self.sequential_update, self.uniform_fraction
-                )
+                # Step 2: continuous policy and codebook, eq. 8, given the updated discrete policy; the features extractor
+                # belongs to step 1
+                features = features.detach()
+                latents, k = self._actions_to_improve(replay_data, features)
+                diffusion_loss, q_loss = continuous_policy_loss(policy, replay_data, features, critic_features, latents, k)
                 loss = diffusion_loss + alpha * q_loss
-                gradient_step(loss, [policy.continuous_optimizer, *codebook_optimizer], self.max_grad_norm)
-                self.actor.codebook.project()
+                gradient_step(loss, [policy.continuous_optimizer, policy.codebook_optimizer], self.max_grad_norm)
+                policy.actor.codebook.project()
                 losses |= {"continuous_loss": loss, "diffusion_loss_continuous": diffusion_loss}
 
                 self.update_targets(self.tau)
@@ -338,27 +281,52 @@ class CHDP(HybridOffPolicyAlgorithm):
             self.logger.record("train/codebook_usage", usage)
             self.logger.record("train/codebook_perplexity", perplexity)
 
+    def _latents_of_today(self, replay_data: HybridReplaySamples) -> tuple[HybridReplaySamples, th.Tensor]:
+        """:return: the batch with latents that decode to the stored actions, and the share that did not before"""
+        return relabel_latents(self.policy, replay_data)
+
+    def _parameters_of_latents(self, replay_data: HybridReplaySamples) -> th.Tensor | None:
+        """:return: (B, Pmax) parameters with which the discrete policy's latents are valued, None: the continuous policy's"""
+        return None
+
+    def _actions_to_improve(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :param replay_data: a batch
+        :param features: (B, features_dim) features of the policies, without gradient
+        :return: latents (B, latent_dim) and discrete actions (B,) whose parameters are improved: those of the discrete policy,
+            and uniformly random ones for a share of ``uniform_fraction`` of the batch
+        """
+        n_uniform = round(self.uniform_fraction * len(features))
+        with th.no_grad():
+            latents, k = self.actor.sample_latents(features[n_uniform:])
+            if n_uniform > 0:
+                uniform_latents, uniform_k, _ = self.actor.random_actions(n_uniform)
+                latents, k = th.cat([uniform_latents, latents]), th.cat([uniform_k, k])
+        return latents, k
+
     def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         if not self.explore_parts:
             return super()._exploratory_rows(rows, rng)
         assert self._last_obs is not None, "self._last_obs was not set"
-        return vary_parts(self.policy, self._last_obs, rows, rng)  # type: ignore[arg-type]
+        return vary_parts(self.policy, self._last_obs, rows, rng)
 
     def _update_learning_rates(self) -> None:
         """Set the learning rates of all optimizers according to their schedules."""
         policy = self.policy
         self._update_learning_rate([policy.critic.optimizer, policy.discrete_optimizer, policy.continuous_optimizer])
-        if policy.codebook_optimizer is not None:
-            rate = self.codebook_lr_factor * self.lr_schedule(self._current_progress_remaining)
-            update_learning_rate(policy.codebook_optimizer, rate)
-            self.logger.record("train/codebook_learning_rate", rate)
+        rate = self.codebook_lr_factor * self.lr_schedule(self._current_progress_remaining)
+        update_learning_rate(policy.codebook_optimizer, rate)
+        self.logger.record("train/codebook_learning_rate", rate)
 
     def _excluded_save_params(self) -> list[str]:
         parts_of_policy = ["actor", "critic", "actor_target", "critic_target", "update_targets"]
         return [*super()._excluded_save_params(), *parts_of_policy]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        state_dicts = ["policy", "critic.optimizer", "policy.discrete_optimizer", "policy.continuous_optimizer"]
-        if self.codebook:
-            state_dicts.append("policy.codebook_optimizer")
-        return state_dicts, []
+        optimizers = [
+            "critic.optimizer",
+            "policy.discrete_optimizer",
+            "policy.continuous_optimizer",
+            "policy.codebook_optimizer",
+        ]
+        return ["policy", *optimizers], []

@@ -2,7 +2,6 @@
 
 import torch as th
 from torch import nn
-from torch.nn import functional as F
 
 from sb3_chdp.common.utils import nearest_row
 
@@ -23,7 +22,7 @@ class Codebook(nn.Module):
     def quantize(self, latents: th.Tensor) -> th.Tensor:
         """
         :param latents: (B, d_e)
-        :return: (B,) index k of the nearest codeword in squared Euclidean distance
+        :return: (B,) index k of the nearest codeword in squared Euclidean distance, the paper's eq. 12
         """
         return nearest_row(latents, self.codewords)
 
@@ -42,33 +41,6 @@ class Codebook(nn.Module):
         """Move the codewords back into [-1, 1], where the latents are, after a gradient step."""
         with th.no_grad():
             self.codewords.clamp_(-1, 1)
-
-
-class OneHotCodebook(nn.Module):
-    """
-    The ablation "without codebook": latents of width K, decoded by argmax and represented by one-hot vectors.
-
-    :param n_discrete_actions: number K of discrete actions
-    """
-
-    def __init__(self, n_discrete_actions: int):
-        super().__init__()
-        self.n_discrete_actions = self.latent_dim = n_discrete_actions
-
-    def quantize(self, latents: th.Tensor) -> th.Tensor:
-        """See :meth:`Codebook.quantize`."""
-        return latents.argmax(dim=1)
-
-    def forward(self, k: th.Tensor) -> th.Tensor:
-        """:return: (B, K) one-hot vectors"""
-        return F.one_hot(k, self.n_discrete_actions).float()
-
-    def representative_latents(self, k: th.Tensor) -> th.Tensor:
-        """:return: (B, K) vectors of 1 at k and -1 elsewhere"""
-        return 2 * self(k) - 1
-
-    def project(self) -> None:
-        """Nothing to do, see :meth:`Codebook.project`."""
 
 
 def codebook_usage(k: th.Tensor, n_discrete_actions: int) -> tuple[float, float]:

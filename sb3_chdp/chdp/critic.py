@@ -1,5 +1,7 @@
 """The twin critic of CHDP."""
 
+from typing import Any
+
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -49,7 +51,7 @@ class HybridCritic(ContinuousCritic):
 
     def __init__(
         self,
-        observation_space: spaces.Space,
+        observation_space: spaces.Space[Any],
         latent_dim: int,
         n_parameters: int,
         net_arch: list[int],

@@ -43,22 +43,22 @@ def vary_parts(
     :param rng: random generator
     :return: (n, columns) rows
     """
-    n, spec = len(rows), policy.action_space.spec
-    columns = slice(1, spec.row_size)
+    n, spec, columns = len(rows), policy.action_space.spec, policy.action_space.columns
     kinds = rng.integers(4, size=(n, 1))
 
     random = policy.random_rows(rng, n)
     of_random_k = random.copy()
     with th.no_grad():
         features = policy.actor.features(policy.obs_to_tensor(observation)[0])
-        k = th.as_tensor(random[:, 0], device=policy.device).long()
-        of_random_k[:, columns] = policy.actor.sample_parameters(features, k).cpu().numpy()
+        k = th.as_tensor(columns.discrete_actions(random), device=policy.device)
+        columns.view(of_random_k, "parameters")[:] = policy.actor.sample_parameters(features, k).cpu().numpy()
 
-    mask = spec.mask[rows[:, 0].astype(int)]
+    mask = spec.mask[columns.discrete_actions(rows)]
     elsewhere, nearby = rows.copy(), rows.copy()
-    random[:, columns] = random_parameters(rng, spec.mask[random[:, 0].astype(int)])
-    elsewhere[:, columns] = random_parameters(rng, mask)
+    columns.view(random, "parameters")[:] = random_parameters(rng, spec.mask[columns.discrete_actions(random)])
+    columns.view(elsewhere, "parameters")[:] = random_parameters(rng, mask)
     low, high = np.log(NOISE_SCALES)
     scales = np.exp(rng.uniform(low, high, (n, 1)))
-    nearby[:, columns] = reflect(rows[:, columns] + scales * rng.normal(size=mask.shape)) * mask
+    noise = scales * rng.normal(size=mask.shape)
+    columns.view(nearby, "parameters")[:] = reflect(columns.view(rows, "parameters") + noise) * mask
     return np.choose(kinds, [of_random_k, elsewhere, nearby, random])

@@ -3,31 +3,23 @@
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.samples import HybridReplaySamples
 
-IMPROVEMENT_QS = ("q1", "min", "mean")
-IMPROVEMENT_PARAMETERS = ("stored", "policy")
 
-
-def relabel_latents(
-    policy: CHDPPolicy, replay_data: HybridReplaySamples, replace: bool
-) -> tuple[HybridReplaySamples, th.Tensor]:
+def relabel_latents(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> tuple[HybridReplaySamples, th.Tensor]:
     """
-    Look for latents that the codebook has moved away from.
+    Give latents that the codebook has moved away from the present codeword of the stored action.
 
     :param policy: the networks
     :param replay_data: a batch
-    :param replace: whether such latents give way to the present codeword of the stored action
-    :return: the batch, and the share of its latents that do not decode to the stored action
+    :return: the batch, and the share of its latents that did not decode to the stored action
     """
     codebook = policy.actor.codebook
     drifted = codebook.quantize(replay_data.latents) != replay_data.discrete_actions
-    if replace:
-        present = codebook.representative_latents(replay_data.discrete_actions)
-        replay_data = replay_data._replace(latents=th.where(drifted[:, None], present, replay_data.latents))
-    return replay_data, drifted.float().mean()
+    present = codebook.representative_latents(replay_data.discrete_actions)
+    latents = th.where(drifted[:, None], present, replay_data.latents)
+    return replay_data._replace(latents=latents), drifted.float().mean()
 
 
 @th.no_grad()
@@ -47,8 +39,8 @@ def critic_loss(
     policy: CHDPPolicy, replay_data: HybridReplaySamples, n_target_candidates: int
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """
-    Mean squared Bellman errors (eq. CHDP_critic_loss_overview), weighted if the replay is prioritised, with a gradient for
-    the codebook, which may be used.
+    Eq. 10, (Q_j(s, e, a) - y)^2, with the target of eq. 11, y = r + gamma min_j Q'_j(s', e', a'); weighted if the replay is
+    prioritised. It has a gradient for the codebook, which may be used.
 
     :param policy: the networks
     :param replay_data: a batch
@@ -72,30 +64,25 @@ def discrete_policy_loss(
     replay_data: HybridReplaySamples,
     actor_features: th.Tensor,
     critic_features: th.Tensor,
-    improvement_q: str,
-    improvement_parameters: str,
+    parameters: th.Tensor | None = None,
 ) -> tuple[th.Tensor, th.Tensor]:
     """
-    Eq. discrete_policy_loss_chdp_final: Q of latents drawn through the whole chain, with the stored parameters.
+    Eq. 7, L_d - alpha Q1(s, e, a): Q of latents e drawn through the whole chain.
 
     :param policy: the networks
     :param replay_data: a batch
     :param actor_features: (B, features_dim) features of the policies
     :param critic_features: (B, features_dim) features of the critics
-    :param improvement_q: one of ``IMPROVEMENT_QS``
-    :param improvement_parameters: one of ``IMPROVEMENT_PARAMETERS``; "policy" takes the parameters that the continuous
-        policy draws for the drawn latents instead, without gradient
-    :return: diffusion loss and policy improvement loss
+    :param parameters: (B, Pmax) parameters a of the drawn latents; None: those that the continuous policy draws for them
+    :return: diffusion loss L_d and policy improvement loss -Q1
     """
     discrete_policy = policy.actor.discrete_policy
     diffusion_loss = discrete_policy.diffusion_loss(replay_data.latents, actor_features)
     latents = discrete_policy.sample(actor_features)
-    parameters = replay_data.parameters
-    if improvement_parameters == "policy":
+    if parameters is None:
         with th.no_grad():
             parameters = policy.actor.sample_parameters(actor_features, policy.actor.codebook.quantize(latents))
-    q_values = q_to_ascend(policy.critic, critic_features, latents, parameters, improvement_q)
-    return diffusion_loss, -q_values.mean()
+    return diffusion_loss, -policy.critic.q1_values(critic_features, latents, parameters).mean()
 
 
 def continuous_policy_loss(
@@ -103,50 +90,23 @@ def continuous_policy_loss(
     replay_data: HybridReplaySamples,
     actor_features: th.Tensor,
     critic_features: th.Tensor,
-    improvement_q: str,
-    sequential_update: bool,
-    uniform_fraction: float,
-) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+    latents: th.Tensor,
+    k: th.Tensor,
+) -> tuple[th.Tensor, th.Tensor]:
     """
-    Eq. continuous_policy_loss_chdp_final: Q of parameters drawn through the whole chain, given latents of the updated
-    discrete policy; the gradient reaches the codebook through the condition of the chain.
+    Eq. 8, L_d - alpha Q1(s, e, a): Q of parameters a drawn through the whole chain; the gradient reaches the codebook through
+    the condition of the chain.
 
     :param policy: the networks
     :param replay_data: a batch
     :param actor_features: (B, features_dim) features of the policies
     :param critic_features: (B, features_dim) features of the critics
-    :param improvement_q: one of ``IMPROVEMENT_QS``
-    :param sequential_update: False takes the stored latents and actions instead
-    :param uniform_fraction: share of the batch that takes uniformly random actions and their codewords instead
-    :return: diffusion loss, policy improvement loss, and the (B,) discrete actions
+    :param latents: (B, latent_dim) latents e, without gradient
+    :param k: (B,) discrete actions that they decode to
+    :return: diffusion loss L_d and policy improvement loss -Q1
     """
-    actor = policy.actor
-    # The features extractor belongs to the discrete policy
-    actor_features = actor_features.detach()
-    stored_k = replay_data.discrete_actions
+    actor, stored_k = policy.actor, replay_data.discrete_actions
     condition = th.cat([actor_features, actor.codebook(stored_k).detach()], dim=1)
     diffusion_loss = actor.continuous_policy.diffusion_loss(replay_data.parameters, condition, actor.mask(stored_k))
-
-    n_uniform = round(uniform_fraction * len(stored_k))
-    if sequential_update:
-        with th.no_grad():
-            latents, k = actor.sample_latents(actor_features[n_uniform:])
-    else:
-        latents, k = replay_data.latents[n_uniform:], stored_k[n_uniform:]
-    if n_uniform > 0:
-        uniform_k = th.randint(actor.codebook.n_discrete_actions, (n_uniform,), device=k.device)
-        k = th.cat([uniform_k, k])
-        latents = th.cat([actor.codebook.representative_latents(uniform_k), latents])
     parameters = actor.sample_parameters(actor_features, k)
-    q_values = q_to_ascend(policy.critic, critic_features, latents, parameters, improvement_q)
-    return diffusion_loss, -q_values.mean(), k
-
-
-def q_to_ascend(
-    critic: HybridCritic, critic_features: th.Tensor, latents: th.Tensor, parameters: th.Tensor, improvement_q: str
-) -> th.Tensor:
-    """:return: (B, 1) the Q that the policies ascend; gradient flows to the action only"""
-    if improvement_q == "q1":
-        return critic.q1_values(critic_features, latents, parameters)
-    q1, q2 = critic.q_values(critic_features, latents, parameters)
-    return th.min(q1, q2) if improvement_q == "min" else 0.5 * (q1 + q2)
+    return diffusion_loss, -policy.critic.q1_values(critic_features, latents, parameters).mean()

@@ -18,9 +18,9 @@ from sb3_chdp.chdp.candidates import (
     random_candidates,
     varied_candidates,
 )
-from sb3_chdp.chdp.codebook import Codebook, OneHotCodebook
+from sb3_chdp.chdp.codebook import Codebook
 from sb3_chdp.chdp.critic import HybridCritic
-from sb3_chdp.chdp.diffusion import DeterministicModel, DiffusionModel
+from sb3_chdp.chdp.diffusion import DiffusionModel
 from sb3_chdp.chdp.whitening import WhiteningExtractor
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.policies import CnnFeatures, CombinedFeatures, HybridPolicy
@@ -56,18 +56,13 @@ class CHDPPolicy(HybridPolicy):
     :param parameter_degree: highest degree of the Chebyshev polynomials of the parameters that the critics see (1: the
         parameters as they are), see :func:`chebyshev_features`
     :param bilinear: whether the critics see the products of latent and parameters as well, see :class:`HybridCritic`
-    :param diffusion: whether the policies are diffusion models (False: deterministic MLPs)
-    :param codebook: whether discrete actions are represented by codewords (False: one-hot vectors)
     :param n_diffusion_steps: number N of denoising steps
-    :param beta_schedule: see :class:`NoiseSchedule`
-    :param variance_type: see :class:`NoiseSchedule`
     :param n_action_candidates: number of actions drawn per observation, of which the one with the highest min(Q1, Q2) of
         the target critics acts
     :param n_random_candidates: number of uniformly random actions that compete with these
     :param n_refinement_candidates: number of variations of the best of all these whose values are compared with its own, in
         each of two rounds with standard deviations of 0.1 and 0.03 of the scaled parameters; in deterministic predictions only
     :param uniform_fraction: share of the drawn candidates whose discrete action is uniformly random
-    :param exploration_noise: standard deviation of the exploration noise of policies without diffusion
     :raises ValueError: if ``whitening`` comes with another features extractor than :class:`FlattenExtractor`
     """
 
@@ -76,7 +71,7 @@ class CHDPPolicy(HybridPolicy):
 
     def __init__(
         self,
-        observation_space: spaces.Space,
+        observation_space: spaces.Space[Any],
         action_space: HybridBox,
         lr_schedule: Schedule,
         net_arch: list[int] | dict[str, list[int]] | None = None,
@@ -91,16 +86,11 @@ class CHDPPolicy(HybridPolicy):
         layer_norm: bool = False,
         parameter_degree: int = 1,
         bilinear: bool = False,
-        diffusion: bool = True,
-        codebook: bool = True,
         n_diffusion_steps: int = 15,
-        beta_schedule: str = "vp",
-        variance_type: str = "fixed_large",
         n_action_candidates: int = 16,
         n_random_candidates: int = 0,
         n_refinement_candidates: int = 0,
         uniform_fraction: float = 0.25,
-        exploration_noise: float = 0.1,
     ):
         if optimizer_kwargs is None:
             optimizer_kwargs = default_optimizer_kwargs(optimizer_class)
@@ -126,16 +116,11 @@ class CHDPPolicy(HybridPolicy):
         self.layer_norm = layer_norm
         self.parameter_degree = parameter_degree
         self.bilinear = bilinear
-        self.diffusion = diffusion
-        self.use_codebook = codebook
         self.n_diffusion_steps = n_diffusion_steps
-        self.beta_schedule = beta_schedule
-        self.variance_type = variance_type
         self.n_action_candidates = n_action_candidates
         self.n_random_candidates = n_random_candidates
         self.n_refinement_candidates = n_refinement_candidates
         self.uniform_fraction = uniform_fraction
-        self.exploration_noise = exploration_noise
         self._build(lr_schedule)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
@@ -163,8 +148,7 @@ class CHDPPolicy(HybridPolicy):
             self.parameter_degree,
             self.bilinear,
         )
-        k_total = spec.n_discrete_actions
-        codebook = Codebook(k_total, latent_dim) if self.use_codebook else OneHotCodebook(k_total)
+        codebook = self._make_codebook(spec.n_discrete_actions, latent_dim)
         self.actor = CooperativeActor(
             self.observation_space,
             self.action_space,
@@ -186,27 +170,19 @@ class CHDPPolicy(HybridPolicy):
         self.discrete_optimizer = self._make_optimizer(discrete_parameters, lr_schedule)
         self.continuous_optimizer = self._make_optimizer(list(self.actor.continuous_policy.parameters()), lr_schedule)
         self.critic.optimizer = self._make_optimizer(list(self.critic.parameters()), lr_schedule)
-        self.codebook_optimizer: th.optim.Optimizer | None = None
-        if self.use_codebook:
-            self.codebook_optimizer = self._make_optimizer(list(codebook.parameters()), lr_schedule)
+        self.codebook_optimizer = self._make_optimizer(list(codebook.parameters()), lr_schedule)
 
         # Noise of deterministic predictions, the same for every model
         generator = th.Generator().manual_seed(0)
         for name, model in (("latent", self.actor.discrete_policy), ("parameter", self.actor.continuous_policy)):
-            self.register_buffer(f"fixed_{name}_noise", model.draw_noise(FIXED_NOISE_CHAINS, generator), persistent=False)
+            noise = th.randn((model.n_steps, FIXED_NOISE_CHAINS, model.dim), generator=generator)
+            self.register_buffer(f"fixed_{name}_noise", noise, persistent=False)
 
-    def _make_model(self, dim: int, condition_dim: int, net_arch: list[int]) -> DiffusionModel | DeterministicModel:
-        if not self.diffusion:
-            return DeterministicModel(dim, condition_dim, net_arch, self.activation_fn, self.exploration_noise)
-        return DiffusionModel(
-            dim,
-            condition_dim,
-            self.n_diffusion_steps,
-            net_arch,
-            self.activation_fn,
-            self.beta_schedule,
-            self.variance_type,
-        )
+    def _make_codebook(self, n_discrete_actions: int, latent_dim: int) -> Codebook:
+        return Codebook(n_discrete_actions, latent_dim)
+
+    def _make_model(self, dim: int, condition_dim: int, net_arch: list[int]) -> DiffusionModel:
+        return DiffusionModel(dim, condition_dim, self.n_diffusion_steps, net_arch, self.activation_fn)
 
     def _make_optimizer(self, parameters: list[nn.Parameter], lr_schedule: Schedule) -> th.optim.Optimizer:
         return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
@@ -275,12 +251,12 @@ class CHDPPolicy(HybridPolicy):
             self.n_refinement_candidates if deterministic else 0,
             hashes,
         )
-        return th.cat([k[:, None].float(), parameters, latents], dim=1)
+        return self.action_space.columns.pack(discrete_actions=k.float(), parameters=parameters, latents=latents)
 
     def random_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """Uniformly random actions; their latents scatter around the codewords and decode to the actions."""
-        rows = super().random_rows(rng, n)
-        k = th.as_tensor(rows[:, 0], device=self.device).long()
+        rows, columns = super().random_rows(rng, n), self.action_space.columns
+        k = th.as_tensor(columns.discrete_actions(rows), device=self.device)
         codebook = self.actor.codebook
         centres = codebook.representative_latents(k)
         latents = centres.clone()
@@ -295,7 +271,7 @@ class CHDPPolicy(HybridPolicy):
             if len(undecided) == 0:
                 break
             spread /= 2
-        rows[:, self.action_space.spec.row_size :] = latents.cpu().numpy()
+        columns.view(rows, "latents")[:] = latents.cpu().numpy()
         return rows
 
     def set_training_mode(self, mode: bool) -> None:
@@ -323,16 +299,11 @@ class CHDPPolicy(HybridPolicy):
                 layer_norm=self.layer_norm,
                 parameter_degree=self.parameter_degree,
                 bilinear=self.bilinear,
-                diffusion=self.diffusion,
-                codebook=self.use_codebook,
                 n_diffusion_steps=self.n_diffusion_steps,
-                beta_schedule=self.beta_schedule,
-                variance_type=self.variance_type,
                 n_action_candidates=self.n_action_candidates,
                 n_random_candidates=self.n_random_candidates,
                 n_refinement_candidates=self.n_refinement_candidates,
                 uniform_fraction=self.uniform_fraction,
-                exploration_noise=self.exploration_noise,
                 lr_schedule=self._dummy_schedule,  # dummy lr schedule, not needed for loading policy alone
             )
         )

@@ -4,11 +4,15 @@ from typing import Any
 
 import optuna
 
+from sb3_chdp.common.buffers import PrioritizedReplayBuffer
+
 NET_ARCHS = {
     "small": {"pi": [64, 64], "qf": [128, 128]},
     "medium": {"pi": [128, 128], "qf": [256, 256]},
     "big": {"pi": [256, 256], "qf": [256, 256]},
 }
+# By what Optuna stores
+REPLAY_BUFFERS = {None: None, "PrioritizedReplayBuffer": PrioritizedReplayBuffer}
 
 
 def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
@@ -21,6 +25,7 @@ def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     for name in ("batch_size", "latent_dim", "gradient_steps", "n_target_candidates"):
         hyperparams[name] = 2 ** hyperparams.pop(f"{name}_pow")
     net_arch = NET_ARCHS[hyperparams.pop("net_arch")]
+    hyperparams["replay_buffer_class"] = REPLAY_BUFFERS[hyperparams["replay_buffer_class"]]
     critic_kwargs = {name: hyperparams.pop(name) for name in ("layer_norm", "parameter_degree", "bilinear")}
     hyperparams["policy_kwargs"] = {"net_arch": net_arch, **critic_kwargs}
     return hyperparams
@@ -51,7 +56,7 @@ def sample_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_a
         "n_target_candidates_pow": trial.suggest_int("n_target_candidates_pow", 0, 4),
         "uniform_fraction": trial.suggest_categorical("uniform_fraction", [0.0, 0.25, 0.5, 0.75]),
         "explore_parts": trial.suggest_categorical("explore_parts", [False, True]),
-        "prioritized_replay": trial.suggest_categorical("prioritized_replay", [False, True]),
+        "replay_buffer_class": trial.suggest_categorical("replay_buffer_class", list(REPLAY_BUFFERS)),
         "layer_norm": trial.suggest_categorical("layer_norm", [False, True]),
         "parameter_degree": trial.suggest_categorical("parameter_degree", [1, 4]),
         "bilinear": trial.suggest_categorical("bilinear", [False, True]),

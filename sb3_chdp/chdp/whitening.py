@@ -1,5 +1,7 @@
 """The features extractor that lets CHDP's networks see small differences of observations."""
 
+from typing import Any
+
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -35,7 +37,7 @@ class WhiteningExtractor(FlattenExtractor):
     running_transform: th.Tensor
     running_count: th.Tensor
 
-    def __init__(self, observation_space: spaces.Space):
+    def __init__(self, observation_space: spaces.Space[Any]):
         super().__init__(observation_space)
         n = self._features_dim
         self._features_dim = 2 * n

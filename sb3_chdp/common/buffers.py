@@ -20,7 +20,7 @@ Index = tuple[np.ndarray, np.ndarray]
 
 
 class PrioritizedReplayBufferSamples(NamedTuple):
-    """SB3's ``ReplayBufferSamples`` and the (B, 1) importance weights in (0, 1]."""
+    """SB3's ``ReplayBufferSamples``, the (B, 1) importance weights in (0, 1], and where the transitions are stored."""
 
     observations: PyTorchObs
     actions: th.Tensor
@@ -28,6 +28,7 @@ class PrioritizedReplayBufferSamples(NamedTuple):
     dones: th.Tensor
     rewards: th.Tensor
     weights: th.Tensor
+    indices: Index
     # For n-step replay buffers, which this is not
     discounts: None = None
 
@@ -60,7 +61,6 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         size = self.buffer_size * self.n_envs
         self._priorities = np.zeros(math.ceil(size / BLOCK) * BLOCK, dtype=np.float32)
         self.max_priority = 1.0
-        self._last_batch: Index = (np.zeros(0, dtype=int), np.zeros(0, dtype=int))
 
     @property
     def priorities(self) -> np.ndarray:
@@ -79,7 +79,6 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         :return: a batch with its weights
         """
         index, probabilities = self._draw(batch_size)
-        self._last_batch = index
         weights = (self.size() * self.n_envs * probabilities) ** -self.beta
         return PrioritizedReplayBufferSamples(
             observations=self._observations_at(self.observations, index, env),
@@ -89,14 +88,16 @@ class PrioritizedReplayBuffer(ReplayBuffer):
             dones=self.to_torch(self.dones[index] * (1 - self.timeouts[index])).reshape(-1, 1),
             rewards=self.to_torch(self._normalize_reward(self.rewards[index].reshape(-1, 1), env)),
             weights=self.to_torch((weights / weights.max()).astype(np.float32)).reshape(-1, 1),
+            indices=index,
         )
 
-    def update_priorities(self, errors: th.Tensor) -> None:
+    def update_priorities(self, indices: Index, errors: th.Tensor) -> None:
         """
-        :param errors: (B,) TD errors of the last batch, of any sign
+        :param indices: those of a batch that was sampled
+        :param errors: (B,) its TD errors, of any sign
         """
         priorities = (errors.abs().cpu().numpy() + PRIORITY_EPSILON) ** self.alpha
-        self.priorities[self._last_batch] = priorities
+        self.priorities[indices] = priorities
         self.max_priority = max(self.max_priority, float(priorities.max()))
 
     def _draw(self, batch_size: int) -> tuple[Index, np.ndarray]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs, ReplayBufferSamples
 
-from sb3_chdp.common.buffers import PrioritizedReplayBufferSamples
+from sb3_chdp.common.buffers import Index, PrioritizedReplayBufferSamples
 from sb3_chdp.common.hybrid_box import HybridBox
 
 
@@ -15,7 +15,7 @@ class HybridReplaySamples(NamedTuple):
 
     Shapes: actions (B, columns), the rows; of these discrete_actions (B,) int64, parameters (B, Pmax) in [-1, 1] with
     padding 0, or (B, P) those of all actions, latents (B, latent_dim), which may be 0 columns; rewards, dones, discounts
-    and weights (B, 1).
+    and weights (B, 1); indices say where a prioritised buffer stores them.
     """
 
     observations: PyTorchObs
@@ -28,6 +28,7 @@ class HybridReplaySamples(NamedTuple):
     rewards: th.Tensor
     discounts: th.Tensor | float
     weights: th.Tensor | float = 1.0
+    indices: Index | None = None
 
 
 def name_columns(
@@ -50,4 +51,5 @@ def name_columns(
         rewards=replay_data.rewards,
         discounts=gamma if replay_data.discounts is None else replay_data.discounts,
         weights=getattr(replay_data, "weights", 1.0),
+        indices=getattr(replay_data, "indices", None),
     )
