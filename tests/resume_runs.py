@@ -25,15 +25,15 @@ from sb3_chdp.common.resume import ResumableCheckpoint, resume
 from tests.algorithms import make_model
 from tests.hybrid_envs import UNIT
 
-SAVE_FREQ = 15
-TOTAL = 240
+# Steps between checkpoints, calls of env.step() between evaluations
+SAVE_STEPS, EVAL_FREQ = 16, 9
+# Steps: the buffer is full before the end
+TOTAL, BUFFER_SIZE = 120, 80
 
 
 class WalkEnv(gym.Env):
     """
-    A walk on a line with noise: reward for staying near 0, episodes end at +-3 or are cut by a TimeLimit.
-
-    :param resumable: whether it has ``get_state`` and ``set_state``
+    A walk on a line with noise: reward for staying near 0, episodes end at +-3.
     """
 
     def __init__(self):
@@ -58,6 +58,8 @@ class WalkEnv(gym.Env):
 
 
 class ResumableWalkEnv(WalkEnv):
+    """The walk with the two methods that exact resuming needs."""
+
     def get_state(self):
         return {"x": self.x, "v": np.array([self.v]), "generator": self.np_random.bit_generator.state}
 
@@ -76,26 +78,33 @@ def make_env(n_envs, folder=None, env_class=ResumableWalkEnv, normalize=False, v
     return VecNormalize(env) if normalize else env
 
 
-# Beside SMALL: what is worth a run of its own
-VARIANTS = {
-    "plain": ("CHDP", {}),
-    "prioritized": ("CHDP", dict(prioritized_replay=True, policy_kwargs=dict(net_arch=[8], whitening=True))),
-    "n_step": ("CHDP", dict(n_steps=3)),
-    "frugal": ("PATD3", dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False))),
-    "episodes": ("PDQNTD3", dict(train_freq=(1, "episode"), gradient_steps=-1)),
-    "delayed": ("HHQNTD3", dict(train_freq=4, gradient_steps=2, policy_delay=3)),
-    "noise": ("PDQNTD3", dict(action_noise=True)),
+# Algorithm, number of environments and settings: each setting that has a state of its own is on in one of them
+RUNS = {
+    "CHDP-1": dict(prioritized_replay=True, policy_kwargs=dict(net_arch=[8], whitening=True)),
+    "CHDP-4": dict(n_steps=3),
+    "HPPO-1": {},
+    "HPPO-4": {},
+    "PATD3-1": {},
+    "PATD3-4": dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False)),
+    "PDQNTD3-1": dict(train_freq=(1, "episode"), gradient_steps=-1),
+    "PDQNTD3-4": dict(action_noise=True),
+    "HHQNTD3-1": {},
+    "HHQNTD3-4": dict(train_freq=4, gradient_steps=2, policy_delay=3),
+    "HyARTD3-1": {},
+    "HyARTD3-4": {},
 }
 
 
-def train(folder, algorithm, n_envs, normalize=False, variant="plain", total=TOTAL, **env_kwargs):
+def train(folder, name):
     """Train or go on: what is run again and again until it ends."""
+    algorithm, n_envs = name.split("-")[0], int(name.split("-")[1])
+    normalize = n_envs > 1
     replay_store.CHUNK_BYTES = 1000
-    env = make_env(n_envs, folder / "monitor", normalize=normalize, **env_kwargs)
+    env = make_env(n_envs, folder / "monitor", normalize=normalize)
     eval_env = make_env(1, normalize=normalize, seed=77)
-    kwargs = dict(VARIANTS[variant][1])
+    kwargs = dict(RUNS[name])
     if algorithm != "HPPO":
-        kwargs.setdefault("buffer_size", 160)  # overwritten after 160 steps
+        kwargs["buffer_size"] = BUFFER_SIZE
     try:
         model = resume(folder / "checkpoints", env, device="cpu")
         resumed_at = model.num_timesteps
@@ -107,11 +116,11 @@ def train(folder, algorithm, n_envs, normalize=False, variant="plain", total=TOT
             model.action_noise = OrnsteinUhlenbeckActionNoise(np.zeros(size), np.full(size, 0.3))
     model.set_logger(configure(str(folder / "log"), ["csv", "json"]))
     callbacks = [
-        EvalCallback(eval_env, eval_freq=25, n_eval_episodes=2, log_path=str(folder), verbose=0),
-        ResumableCheckpoint(SAVE_FREQ, folder / "checkpoints"),
+        EvalCallback(eval_env, eval_freq=EVAL_FREQ, n_eval_episodes=2, log_path=str(folder), verbose=0),
+        ResumableCheckpoint(SAVE_STEPS // n_envs, folder / "checkpoints"),
     ]
     log_interval = 2 if algorithm == "HPPO" else 4
-    model.learn(total - model.num_timesteps, callbacks, log_interval=log_interval, reset_num_timesteps=False)
+    model.learn(TOTAL - model.num_timesteps, callbacks, log_interval=log_interval, reset_num_timesteps=False)
     return model, resumed_at
 
 
@@ -139,7 +148,8 @@ def result(model, folder):
             add(name, dict(enumerate(value)))
         else:
             array = value.detach().numpy() if isinstance(value, th.Tensor) else np.asarray(value)
-            parts[name] = hashlib.sha256(array.tobytes() + str(array.dtype).encode()).hexdigest()[:16]
+            content = str(value).encode() if array.dtype.hasobject else array.tobytes()
+            parts[name] = hashlib.sha256(content + str(array.dtype).encode()).hexdigest()[:16]
 
     for name in model._get_torch_save_params()[0]:
         add(name, recursive_getattr(model, name).state_dict())
@@ -198,16 +208,16 @@ class Moments:
         setattr(owner, name, hooked)
 
 
-def main(folder, kill_at, kwargs):
+def main(folder, kill_at, name):
     """Run in a process of its own; writes what came out."""
     th.set_num_threads(1)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     moments = Moments(kill_at)
-    model, resumed_at = train(folder, **kwargs)
+    model, resumed_at = train(folder, name)
     outcome = {"result": result(model, folder), "n_moments": moments.n, "resumed_at": resumed_at}
     (folder / "outcome.json").write_text(json.dumps(outcome))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], json.loads(sys.argv[2]), json.loads(sys.argv[3]))
+    main(sys.argv[1], json.loads(sys.argv[2]), sys.argv[3])

@@ -29,6 +29,10 @@ def _fsync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
+def _checksum(files: dict[str, dict[str, Any]]) -> str:
+    return hashlib.sha256(json.dumps(files).encode()).hexdigest()
+
+
 class GenerationWriter:
     """
     A generation that is being written.
@@ -111,7 +115,7 @@ class CheckpointStore:
             writer = GenerationWriter(temporary)
             fill(writer)
             files = dict(writer.files)
-            writer.write(MANIFEST, json.dumps({"files": files}).encode())
+            writer.write(MANIFEST, json.dumps({"files": files, "sha256": _checksum(files)}).encode())
             for path in {(temporary / name).parent for name in files}:
                 _fsync_folder(path)
             temporary.rename(folder)
@@ -152,7 +156,10 @@ def check_generation(folder: Path) -> None:
     """
     manifest = folder / MANIFEST
     try:
-        files = json.loads(manifest.read_bytes())["files"]
+        content = json.loads(manifest.read_bytes())
+        files = content["files"]
+        if content["sha256"] != _checksum(files):
+            raise ValueError("its checksum is another one")
         records = [(folder / name, int(record["size"]), str(record["sha256"])) for name, record in files.items()]
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise DamagedError(f"{manifest} is damaged ({error})") from error

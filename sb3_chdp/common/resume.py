@@ -110,18 +110,27 @@ class ResumableCheckpoint(BaseCallback):
             )
 
     def _on_rollout_start(self) -> None:
-        pending = dict(_RUNS[self.model].pending)
-        _RUNS[self.model].pending.clear()
-        if pending and pending["num_timesteps"] == self.model.num_timesteps:
-            # Here, where it was saved: what others did since then does not count
-            restore_callbacks(self._root, pending["callbacks"])
-            restore_logger(self.model, pending["logger"])
-            restore_generators(self.model, pending["generators"])
-            self.model.start_time = time.time_ns() - pending["elapsed"]
-            self.model._num_timesteps_at_start = pending["_num_timesteps_at_start"]
-        elif self.n_calls // self.save_freq > self._n_due and self._is_between_logs():
+        resumed = self._restore()
+        if not resumed and self.n_calls // self.save_freq > self._n_due and self._is_between_logs():
             self._save()
         self._in_rollout = True
+
+    def _restore(self) -> bool:
+        """
+        Here, where it was saved, and not in ``resume()``: what others did since then does not count.
+
+        :return: whether this is where a checkpoint was taken
+        """
+        pending = dict(_RUNS[self.model].pending)
+        _RUNS[self.model].pending.clear()
+        if not pending or pending["num_timesteps"] != self.model.num_timesteps:
+            return False
+        restore_callbacks(self._root, pending["callbacks"])
+        restore_logger(self.model, pending["logger"])
+        restore_generators(self.model, pending["generators"])
+        self.model.start_time = time.time_ns() - pending["elapsed"]
+        self.model._num_timesteps_at_start = pending["_num_timesteps_at_start"]
+        return True
 
     def _is_between_logs(self) -> bool:
         # On-policy algorithms count rollouts within learn() to tell when to log
@@ -142,6 +151,7 @@ class ResumableCheckpoint(BaseCallback):
         self._in_rollout = False
 
     def _on_training_end(self) -> None:
+        self._restore()  # if there was nothing left to do
         # A callback that stops the training does so before the last transition is stored
         if not self._in_rollout and self._n_rollouts > 0:
             self._save()

@@ -10,7 +10,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.logger import CSVOutputFormat, HumanOutputFormat, JSONOutputFormat
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.vec_env import VecEnv
@@ -119,8 +119,7 @@ def restore_callbacks(root: BaseCallback, saved: dict[str, Any]) -> None:
     present = dict(_callbacks(root))
     for label, parts in saved.items():
         if label not in present:
-            # The list around callbacks has nothing to lose
-            if not label.startswith(("CallbackList", "ConvertCallback")):
+            if not parts["state"].keys() <= vars(ConvertCallback(None)).keys():
                 warnings.warn(f"The checkpoint holds the state of a callback that is not there: {label.rsplit(' ', 1)[0]}")
             continue
         restore_state(present[label], parts["state"])
