@@ -1,5 +1,6 @@
 """Training that is killed and goes on: equal to the last bit, whole or not there, never silently another run."""
 
+import gc
 import json
 import multiprocessing
 import os
@@ -7,9 +8,10 @@ import random
 import shutil
 import subprocess
 import sys
+import threading
 import warnings
-from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -17,6 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, EveryNTimesteps
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_chdp import CHDP, PATD3
@@ -92,6 +95,11 @@ def test_killed_at_any_moments_equals_not_killed(moments, whole_run, tmp_path_fa
     shutil.rmtree(folder)
 
 
+def generations(folder):
+    """:return: folders of the checkpoints, the newest last"""
+    return sorted(folder.glob("*_steps"))
+
+
 def trained(folder, total=60, n_envs=1, save_freq=10, env_class=resume_runs.ResumableWalkEnv, algorithm=PATD3, **kwargs):
     env = make_env(n_envs, env_class=env_class)
     return make_model(algorithm, env, **kwargs).learn(total, ResumableCheckpoint(save_freq, folder))
@@ -111,7 +119,7 @@ def test_buffer_and_counters_agree(n_envs, train_freq, tmp_path):
     assert resumed.num_timesteps == 15 * n_envs == resumed.replay_buffer.size() * n_envs
     # What the stopping callback kept from the buffer is not part of a checkpoint
     before = {1: 10, 3: 12}[train_freq] * n_envs
-    assert sorted(p.name for p in tmp_path.iterdir()) == [f"000002_{before}_steps", f"000003_{15 * n_envs}_steps"]
+    assert [path.name for path in generations(tmp_path)] == [f"000002_{before}_steps", f"000003_{15 * n_envs}_steps"]
 
 
 def damage_nothing_left(path):
@@ -132,7 +140,7 @@ def damage_bit(path):
 def test_damaged_checkpoints(damage, tmp_path, monkeypatch):
     monkeypatch.setattr(replay_store, "CHUNK_BYTES", 200)
     trained(tmp_path / "run")
-    older, newer = sorted((tmp_path / "run").iterdir())
+    older, newer = generations(tmp_path / "run")
     names = sorted(path.relative_to(newer) for path in newer.rglob("*") if path.is_file())
     assert len(names) > 8
     for name in names:
@@ -146,20 +154,22 @@ def test_damaged_checkpoints(damage, tmp_path, monkeypatch):
         shutil.rmtree(copy)
     damage(newer / "model.zip")
     damage(older / "state.npz")
-    with pytest.warns(UserWarning, match=r"(model\.zip|state\.npz) is damaged"), pytest.raises(DamagedError, match=r"state\.npz"):
+    with pytest.warns(UserWarning, match=r"(model\.zip|state\.npz) is damaged"), pytest.raises(
+        DamagedError, match=r"state\.npz"
+    ):
         resume(tmp_path / "run", make_env(1))
 
 
 def test_training_goes_on_after_a_damaged_checkpoint(tmp_path):
     trained(tmp_path)
-    damage_cut(max(tmp_path.iterdir()) / "model.zip")
+    damage_cut(generations(tmp_path)[-1] / "model.zip")
     with pytest.warns(UserWarning, match="is damaged"):
         model = resume(tmp_path, make_env(1))
     model.learn(10, ResumableCheckpoint(5, tmp_path), reset_num_timesteps=False)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert resume(tmp_path, make_env(1)).num_timesteps == 60
-    assert len(list(tmp_path.iterdir())) == 2
+    assert len(generations(tmp_path)) == 2
 
 
 def test_only_new_rows_are_written(tmp_path, monkeypatch):
@@ -181,7 +191,7 @@ def test_only_new_rows_are_written(tmp_path, monkeypatch):
     model = make_model(PATD3, make_env(2), learning_starts=10**6, buffer_size=2000).learn(2000, Checkpoint(50, tmp_path))
     assert len(written) > 15
     assert max(written[5:]) < 25 < written[1] * 10
-    inodes = [{path.stat().st_ino for path in folder.rglob("*.npy")} for folder in tmp_path.iterdir()]
+    inodes = [{path.stat().st_ino for path in folder.rglob("*.npy")} for folder in generations(tmp_path)]
     assert not set.intersection(*inodes), "what damages one generation spares the other"
     np.testing.assert_array_equal(resume(tmp_path, make_env(2)).replay_buffer.observations, model.replay_buffer.observations)
 
@@ -236,7 +246,7 @@ def test_disk_that_takes_no_more(tmp_path):
     class Fill(BaseCallback):
         def _on_step(self):
             if self.n_calls == 35:
-                smallest.append(len(list(tmp_path.iterdir())))
+                smallest.append(len(generations(tmp_path)))
                 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
             return True
 
@@ -247,7 +257,7 @@ def test_disk_that_takes_no_more(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert model.num_timesteps == 60
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["000002_20_steps", "000003_30_steps"]
+    assert [path.name for path in generations(tmp_path)] == ["000002_20_steps", "000003_30_steps"]
     assert resume(tmp_path, make_env(1)).num_timesteps == 30
 
 
@@ -259,10 +269,27 @@ def test_folder_that_cannot_be_written_to(tmp_path):
 
 def test_folder_of_another_run(tmp_path):
     model = trained(tmp_path)
-    with pytest.raises(ValueError, match="save_path .*000006_60_steps of another run.*resume"):
+    with pytest.raises(ValueError, match=r"save_path .*000006_60_steps of another run.*resume"):
         trained(tmp_path)
     model.learn(20, ResumableCheckpoint(10, tmp_path), reset_num_timesteps=False)
     assert resume(tmp_path, make_env(1)).num_timesteps == 80
+
+
+def test_folder_that_another_process_writes_to(tmp_path):
+    trained(tmp_path)
+    code = f"""if True:
+        from sb3_chdp.common.resume import ResumableCheckpoint, resume
+        from tests.resume_runs import make_env
+        model = resume({str(tmp_path)!r}, make_env(1))
+        model.learn(10, ResumableCheckpoint(5, {str(tmp_path)!r}), reset_num_timesteps=False)
+    """
+    model = resume(tmp_path, make_env(1))
+    model.learn(10, ResumableCheckpoint(5, tmp_path), reset_num_timesteps=False)
+    other = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
+    assert "Another process writes checkpoints to" in other.stderr
+    del model
+    gc.collect()
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
 
 
 def test_wrong_use(tmp_path):
@@ -332,7 +359,7 @@ def test_dict_observations(tmp_path):
 
 def test_nothing_runs_when_state_is_read(tmp_path):
     trained(tmp_path)
-    for path in Path(max(tmp_path.iterdir())).rglob("*.np[yz]"):
+    for path in (generations(tmp_path)[-1]).rglob("*.np[yz]"):
         loaded = np.load(path, allow_pickle=False)
         for name in getattr(loaded, "files", []):
             assert loaded[name].dtype.kind in "biufU"
@@ -341,3 +368,22 @@ def test_nothing_runs_when_state_is_read(tmp_path):
     value = {"a": (1, None, float("inf")), 3: [np.float32(0.1), True], "__kind__": "x", "long": [0.1] * 40}
     again = from_bytes(*to_bytes(value))
     assert again == value and type(again[3][0]) is np.float32 and type(again["a"]) is tuple and type(again["long"][0]) is float
+
+
+def test_wrappers_with_a_state_of_their_own(tmp_path):
+    class Counting(gym.Wrapper):
+        def __init__(self, env):
+            super().__init__(env)
+            self.count = 0
+            self.secret = threading.Lock()
+
+        def step(self, action):
+            self.count += 1
+            return self.env.step(action)
+
+    env = DummyVecEnv([lambda: Monitor(Counting(resume_runs.ResumableWalkEnv()))])
+    with pytest.warns(UserWarning, match="Counting keeps secret"):
+        make_model(PATD3, env).learn(25, ResumableCheckpoint(10, tmp_path))
+    again = DummyVecEnv([lambda: Monitor(Counting(resume_runs.ResumableWalkEnv()))])
+    resume(tmp_path, again)
+    assert again.get_attr("count") == [25] == again.get_attr("total_steps")

@@ -1,5 +1,6 @@
 """A folder with the last two generations of a set of files, each complete or not there at all."""
 
+import errno
 import hashlib
 import json
 import os
@@ -8,10 +9,16 @@ import shutil
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 MANIFEST = "manifest.json"
 TEMPORARY = ".writing"
+LOCK = ".lock"
 KEPT = 2
 GENERATION = re.compile(r"(\d{6,})_\d+_steps")
 
@@ -89,6 +96,26 @@ class CheckpointStore:
         self.directory = Path(directory)
         # Those known to be whole, the newest last
         self.whole: list[Path] = []
+        self._lock: IO[str] | None = None
+
+    def lock(self) -> None:
+        """
+        Keep other processes from writing here, until this one ends or the store is gone.
+
+        :raises ValueError: if another process has done so
+        """
+        if fcntl is None or self._lock is not None:
+            return
+        file = (self.directory / LOCK).open("w")
+        try:
+            # Of this process and not of its children, which may outlive it
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.close()
+            if error.errno in (errno.EACCES, errno.EAGAIN):
+                raise ValueError(f"Another process writes checkpoints to {self.directory}") from error
+            return  # not all file systems have locks
+        self._lock = file
 
     def generations(self) -> list[Path]:
         """:return: folders of all generations, damaged ones too, the newest first"""

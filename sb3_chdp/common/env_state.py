@@ -1,4 +1,4 @@
-"""State of vectorised environments: wrappers, generators, Monitor files, and the environments themselves if they can give it."""
+"""State of vectorised environments: wrappers, generators, Monitor files, and of the environments if they can give it."""
 
 import warnings
 from collections import Counter
@@ -12,7 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from sb3_chdp.common.plain_data import constructor_arguments, is_plain, restore_state, state_of
+from sb3_chdp.common.plain_data import is_plain, is_setting, restore_state, state_of
 
 # Attributes of wrappers that say what an environment is, not where it stands
 DESCRIPTIONS = ("class_attributes", "num_envs", "render_mode", "metadata", "reset_infos", "spec", "_metadata", "_cached_spec")
@@ -135,9 +135,9 @@ def restore_env(env: VecEnv, state: dict[str, Any]) -> None:
                 env.env_method("set_wrapper_attr", name, value, indices=i)
     elif "wrappers" in state:
         for each, by_label in zip(envs, state["wrappers"], strict=True):
-            wrappers = list(_wrappers(each))
-            for label, wrapper in zip(_labels(wrappers), wrappers, strict=True):
-                restore_state(wrapper, by_label.get(label, {}))
+            layers = list(_wrappers(each))
+            for label, layer in zip(_labels(layers), layers, strict=True):
+                restore_state(layer, by_label.get(label, {}))
     if state["states"] is not None and has_state(env):
         for i, own in enumerate(state["states"]):
             env.env_method("set_state", own, indices=i)
@@ -167,8 +167,8 @@ def warn_of_losses(env: VecEnv) -> None:
         lost = [
             name
             for name, value in vars(wrapper).items()
-            if name.lstrip("_") not in (*constructor_arguments(type(wrapper)), *DESCRIPTIONS)
-            and name not in state_of(wrapper)
+            if not is_setting(wrapper, name)
+            and name not in (*DESCRIPTIONS, *state_of(wrapper))
             and not isinstance(value, known)
             and not callable(value)
         ]

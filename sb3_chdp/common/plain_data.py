@@ -42,13 +42,18 @@ def is_plain(value: Any) -> bool:
 
 
 @functools.cache
-def constructor_arguments(cls: type) -> frozenset[str]:
+def constructor_arguments(cls: Any) -> frozenset[str]:
     """:return: names of the arguments that a class and its parents are constructed with"""
     names: set[str] = set()
     for parent in cls.__mro__:
         if "__init__" in vars(parent):
-            names.update(inspect.signature(parent.__init__).parameters)
+            names.update(inspect.signature(vars(parent)["__init__"]).parameters)
     return frozenset(names)
+
+
+def is_setting(obj: Any, name: str) -> bool:
+    """:return: whether an attribute is named like an argument of the constructor, perhaps with an underscore in front"""
+    return not isinstance(obj, NESTED) and name.lstrip("_") in constructor_arguments(obj.__class__)
 
 
 def _nested(value: Any) -> Any:
@@ -69,11 +74,10 @@ def state_of(obj: Any, ignored: Collection[str] = ()) -> dict[str, Any]:
     :param ignored: names of attributes to leave out
     :return: values by name of the attribute
     """
-    settings = () if isinstance(obj, NESTED) else constructor_arguments(type(obj))
     state = {}
     for name, value in vars(obj).items():
         value = _nested(value)
-        if name not in ignored and name.lstrip("_") not in settings and is_plain(value):
+        if name not in ignored and not is_setting(obj, name) and is_plain(value):
             state[name] = value
     return state
 
@@ -98,7 +102,8 @@ def restore_state(obj: Any, state: dict[str, Any]) -> None:
     :param state: what :func:`state_of` gave
     """
     for name, value in state.items():
-        setattr(obj, name, _restored(getattr(obj, name, None), value))
+        if not is_setting(obj, name):
+            setattr(obj, name, _restored(getattr(obj, name, None), value))
 
 
 def _encode(value: Any, arrays: list[np.ndarray]) -> Any:

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import device
 
 from sb3_chdp.common.checkpoint_store import GenerationWriter
-from sb3_chdp.common.plain_data import constructor_arguments, is_plain, state_of
+from sb3_chdp.common.plain_data import is_plain, is_setting, state_of
 
 # Arrays that get one row per time step and keep it; all others are written as a whole
 ROW_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
@@ -42,11 +42,10 @@ def buffer_state(buffer: ReplayBuffer) -> dict[str, Any]:
     :return: all that the buffer knows beside the rows: the place of the next one, priorities
     :raises ValueError: if it keeps something else than numbers
     """
-    settings = constructor_arguments(type(buffer))
     harmless = (spaces.Space, VecEnv, device, type)
     for name, value in vars(buffer).items():
-        if name not in (*settings, *ROW_ARRAYS) and not is_plain(value) and not isinstance(value, harmless):
-            raise ValueError(f"Checkpoints hold no {type(buffer).__name__}: its {name} is {type(value)}, not arrays or numbers")
+        if not is_setting(buffer, name) and name not in ROW_ARRAYS and not is_plain(value) and not isinstance(value, harmless):
+            raise ValueError(f"Checkpoints hold no {type(buffer).__name__}: its {name} is not numbers but {type(value)}")
     return state_of(buffer, ignored=ROW_ARRAYS)
 
 

@@ -60,8 +60,9 @@ class ResumableCheckpoint(BaseCallback):
     :param save_freq: Save a checkpoint every ``save_freq`` calls of the callback, each of which is ``n_envs`` steps
     :param save_path: Path to the folder of the checkpoints, which belongs to one run
     :param verbose: Verbosity level: 0 for no output, 2 for indicating when saving a checkpoint
-    :raises ValueError: for a ``save_freq`` below 1; when learning starts, for a folder that holds checkpoints of another
-        run, a callback within another one, or a replay buffer that holds other things than numbers
+    :raises ValueError: for a ``save_freq`` below 1; when learning starts, for a folder that another process writes to or
+        that holds checkpoints of another run, for a callback within another one, and for a replay buffer that holds other
+        things than numbers
     :raises OSError: when learning starts, if the folder cannot be written to
     """
 
@@ -90,6 +91,7 @@ class ResumableCheckpoint(BaseCallback):
         self.save_path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=self.save_path):
             pass
+        self._store.lock()
         if getattr(self.model, "replay_buffer", None) is not None:
             buffer_state(self.model.replay_buffer)  # type: ignore[attr-defined]
         save_env(self.training_env)

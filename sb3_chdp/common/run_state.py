@@ -19,7 +19,7 @@ from sb3_chdp.common.env_state import file_content, restore_env, rewrite, save_e
 from sb3_chdp.common.plain_data import is_plain, restore_state, state_of
 
 # Set anew by whoever constructs the model, or by learn()
-NOT_OF_THE_MODEL = ("_custom_logger", "start_time", "_num_timesteps_at_start", "tensorboard_log", "verbose", "n_envs")
+NOT_OF_THE_MODEL = ("_custom_logger", "start_time", "_num_timesteps_at_start", "n_envs")
 
 
 def _own_modules(model: BaseAlgorithm) -> Iterator[tuple[str, th.nn.Module]]:
