@@ -203,11 +203,11 @@ def test_without_state_a_fresh_episode_begins(vec_env_class, normalize, tmp_path
     env = make_env(2, **kwargs)
     with pytest.warns(UserWarning, match="fresh episode") as said:
         model = make_model(PATD3, env).learn(60, ResumableCheckpoint(8, tmp_path))
-    assert len(said) == 1
+    assert len([w for w in said if "fresh episode" in str(w.message)]) == 1
     again = make_env(2, **kwargs)
     with pytest.warns(UserWarning, match="fresh episode") as said:
         resumed = resume(tmp_path, again)
-    assert len(said) == 1
+    assert len([w for w in said if "fresh episode" in str(w.message)]) == 1
     if normalize:
         np.testing.assert_array_equal(again.ret_rms.var, env.ret_rms.var)
         assert np.abs(again.unnormalize_obs(resumed._last_obs)[:, 0]).max() <= 1.001

@@ -12,6 +12,7 @@ import pytest
 
 pytest.importorskip("rl_zoo3")
 
+from sb3_chdp.cli import prepare_arguments
 from sb3_chdp.common.resume import ResumableCheckpoint
 from sb3_chdp.zoo import register
 from sb3_chdp.zoo_resume import prepare_training
@@ -46,11 +47,15 @@ def run(arguments, kill_at=None):
     return process.exitcode
 
 
+def new_run(folder, *more):
+    """:return: arguments for a run of its own"""
+    return prepare_arguments("train", [*ARGUMENTS.split(), "-f", str(folder), *more])
+
+
 def test_a_killed_training_goes_on(tmp_path):
     whole, killed = (tmp_path / name / "pa_td3" / "Platform-v0_1" for name in "ab")
-    arguments = [*ARGUMENTS.split(), "--seed", "4", "-f"]
-    assert run([*arguments, str(tmp_path / "a")]) == 0
-    assert run([*arguments, str(tmp_path / "b")], kill_at=170) == -signal.SIGKILL
+    assert run(new_run(tmp_path / "a", "--seed", "4")) == 0
+    assert run(new_run(tmp_path / "b", "--seed", "4"), kill_at=170) == -signal.SIGKILL
     assert not (killed / "Platform-v0.zip").exists()
     # The settings of -params are those of the killed run
     assert run(["--resume", str(killed)]) == 0
@@ -64,10 +69,11 @@ def test_a_killed_training_goes_on(tmp_path):
 
 
 def test_what_is_kept_of_the_arguments(tmp_path):
-    assert run([*ARGUMENTS.split(), "-f", str(tmp_path)], kill_at=60) == -signal.SIGKILL
+    arguments = new_run(tmp_path)
+    assert run(arguments, kill_at=60) == -signal.SIGKILL
     folder = tmp_path / "pa_td3" / "Platform-v0_1"
     kept = json.loads((folder / "arguments.json").read_text())
-    assert kept[: len(ARGUMENTS.split())] == ARGUMENTS.split() and kept[-2] == "--seed"
+    assert kept[:-1] == [*arguments, "--seed"]
     assert prepare_training(["--resume", str(folder)]) == kept == prepare_training([f"--resume={folder}"])
 
 
