@@ -54,18 +54,22 @@ class ResumableExperimentManager(ExperimentManager):
             super()._save_config(saved_hyperparams)
 
     def learn(self, model: BaseAlgorithm) -> None:
-        if self.run is None:
+        if self.save_freq <= 0:
             super().learn(model)
             return
+        # Not super(): after an interrupt in the middle of an update it tells callbacks that the training is through
         kwargs: dict[str, Any] = {}
         if self.log_interval != -1:
             # -1 is the algorithm's own, less is none
             kwargs["log_interval"] = self.log_interval if self.log_interval >= 0 else None
+        done = 0 if self.run is None else model.num_timesteps
         try:
-            model.learn(self.n_timesteps - model.num_timesteps, self.callbacks, reset_num_timesteps=False, **kwargs)
+            model.learn(self.n_timesteps - done, self.callbacks, reset_num_timesteps=self.run is None, **kwargs)
         except KeyboardInterrupt:
             pass  # the model is saved all the same
         finally:
+            if self.show_progress:
+                self.callbacks[0].on_training_end()
             assert model.env is not None
             model.env.close()
 

@@ -155,7 +155,8 @@ class ResumableCheckpoint(BaseCallback):
     def _on_training_end(self) -> None:
         self._restore()  # if there was nothing left to do
         # A callback that stops the training does so before the last transition is stored
-        if not self._in_rollout and self._n_rollouts > 0:
+        is_complete = not self._in_rollout and self.model.num_timesteps >= self.model._total_timesteps
+        if is_complete and self._n_rollouts > 0:
             self._save()
             self._n_rollouts = 0
 
