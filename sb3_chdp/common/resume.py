@@ -71,7 +71,7 @@ class ResumableCheckpoint(BaseCallback):
         check_at_least(1, save_freq=save_freq)
         self.save_freq = save_freq
         self.save_path = Path(save_path)
-        self._n_due = 0
+        self._saved_at = 0  # number of calls
         self._n_rollouts = 0
         self._in_rollout = False
         self._replay = ReplayStore()
@@ -113,7 +113,8 @@ class ResumableCheckpoint(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         resumed = self._restore()
-        if not resumed and self.n_calls // self.save_freq > self._n_due and self._is_between_logs():
+        is_due = self.n_calls // self.save_freq > self._saved_at // self.save_freq
+        if not resumed and is_due and self._is_between_logs():
             self._save()
         self._in_rollout = True
 
@@ -161,7 +162,7 @@ class ResumableCheckpoint(BaseCallback):
             self._n_rollouts = 0
 
     def _save(self) -> None:
-        self._n_due = self.n_calls // self.save_freq
+        self._saved_at = self.n_calls
         files: dict[str, dict[str, Any]] = {}
 
         def fill(writer: GenerationWriter) -> None:
