@@ -78,7 +78,9 @@ def test_in_an_interpreter_of_its_own(whole_run, tmp_path):
 
 def test_a_finished_run_stays_as_it_is(whole_run, tmp_path):
     run(tmp_path, "PATD3-4")
+    checkpoints = generations(tmp_path / "checkpoints")
     again = run(tmp_path, "PATD3-4")
+    assert generations(tmp_path / "checkpoints") == checkpoints
     assert again["resumed_at"] == resume_runs.TOTAL
     assert_equal(again, whole_run)
 

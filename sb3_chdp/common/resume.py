@@ -154,7 +154,8 @@ class ResumableCheckpoint(BaseCallback):
         self._in_rollout = False
 
     def _on_training_end(self) -> None:
-        self._restore()  # if there was nothing left to do
+        if self._restore():
+            return  # there was nothing left to do
         # A callback that stops the training does so before the last transition is stored
         is_complete = not self._in_rollout and self.model.num_timesteps >= self.model._total_timesteps
         if is_complete and self._n_rollouts > 0:
