@@ -22,7 +22,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, Every
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from sb3_chdp import CHDP, PATD3
+from sb3_chdp import CHDP, HPPO, PATD3
 from sb3_chdp.common import replay_store
 from sb3_chdp.common.checkpoint_store import DamagedError, GenerationWriter
 from sb3_chdp.common.plain_data import from_bytes, to_bytes
@@ -196,6 +196,39 @@ def test_only_new_rows_are_written(tmp_path, monkeypatch):
     inodes = [{path.stat().st_ino for path in folder.rglob("*.npy")} for folder in generations(tmp_path)]
     assert not set.intersection(*inodes), "what damages one generation spares the other"
     np.testing.assert_array_equal(resume(tmp_path, make_env(2)).replay_buffer.observations, model.replay_buffer.observations)
+
+
+@pytest.mark.parametrize("chunk_bytes", [1, 300])
+@pytest.mark.parametrize("frugal", [False, True])
+def test_rows_are_those_of_the_buffer_wherever_it_stands(chunk_bytes, frugal, tmp_path, monkeypatch):
+    monkeypatch.setattr(replay_store, "CHUNK_BYTES", chunk_bytes)
+    box = spaces.Box(-1, 1, (2,))
+    kwargs = dict(optimize_memory_usage=frugal, handle_timeout_termination=not frugal)
+    buffer, rng = ReplayBuffer(30, box, box, "cpu", **kwargs), np.random.default_rng(0)
+    store = replay_store.ReplayStore()
+    for i in range(60):
+        for _ in range(rng.integers(0, 5)):
+            buffer.add(*rng.uniform(-1, 1, (3, 1, 2)), rng.normal(size=1), rng.integers(0, 2, 1), [{}])
+            store.n_added += 1
+        writer = GenerationWriter(tmp_path / str(i))
+        writer.folder.mkdir()
+        n_rows = store.write(buffer, writer)
+        store.commit(buffer, writer.folder, writer.files)
+        again = ReplayBuffer(30, box, box, "cpu", **kwargs)
+        replay_store.read_rows(again, writer.folder, n_rows)
+        for name, rows in replay_store.row_arrays(buffer).items():
+            np.testing.assert_array_equal(getattr(again, name), rows)
+
+
+def test_hppo_saves_when_it_logs(tmp_path):
+    """It counts rollouts within learn(): a resumed run would log at others."""
+
+    class Stop(BaseCallback):
+        def _on_step(self):
+            return self.n_calls < 85
+
+    make_model(HPPO, make_env(1)).learn(200, [ResumableCheckpoint(10, tmp_path), Stop()], log_interval=3)
+    assert [path.name for path in generations(tmp_path)] == ["000001_30_steps", "000002_60_steps"]
 
 
 @pytest.mark.parametrize("vec_env_class", [DummyVecEnv, SubprocVecEnv])

@@ -17,8 +17,8 @@ from sb3_chdp.common.resume import ResumableCheckpoint
 from sb3_chdp.zoo import register
 from sb3_chdp.zoo_resume import prepare_training
 
+# No preload: rl_zoo3 patches Gymnasium, for the processes of all tests
 PROCESSES = multiprocessing.get_context("forkserver")
-PROCESSES.set_forkserver_preload(["torch._dynamo", "tests.test_zoo_resume"])
 SETTINGS = "learning_starts:40 batch_size:8 n_envs:2 policy_kwargs:dict(net_arch=[8]) buffer_size:200"
 ARGUMENTS = (
     f"--algo pa_td3 --env Platform-v0 -n 240 --save-freq 40 --eval-freq 60 --eval-episodes 2 --verbose 0 -params {SETTINGS}"

@@ -114,8 +114,8 @@ class ReplayStore:
         n_new = self.n_added - base.n_added
         if n_new >= buffer.buffer_size or (base.pos + n_new) % buffer.buffer_size != buffer.pos:
             return set()
-        # SB3 may end the episode of the row before the new ones, and optimize_memory_usage writes to the one behind them
-        rows = np.arange(base.pos - 1, base.pos + n_new + 1) % buffer.buffer_size
+        # With optimize_memory_usage=True the row behind the new ones has changed too
+        rows = np.arange(base.pos, base.pos + n_new + 1) % buffer.buffer_size
         changed = {f"replay/{chunk:06d}.npy" for chunk in np.unique(rows // n_rows)}
         return {name for name in base.files if name.startswith("replay/")} - changed
 
