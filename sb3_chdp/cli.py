@@ -2,6 +2,7 @@
 The command ``sb3-chdp``: rl_zoo3's scripts with the algorithms and environments of this package.
 
     sb3-chdp train --env Platform-v0 -P          train, with rl_zoo3's options; --algo is chdp by default
+    sb3-chdp train --resume logs/chdp/Platform-v0_1    go on with a killed run that was started with --save-freq
     sb3-chdp optimize --env Goal-v0 --n-trials 50      tune hyperparameters with Optuna
     sb3-chdp enjoy --env Platform-v0 -f logs     watch a trained agent
     sb3-chdp record --env Platform-v0 -f logs    record a video of it
@@ -99,7 +100,18 @@ def main() -> None:
         from sb3_chdp.envs.recorder import FrameVideoRecorder
 
         vec_env.VecVideoRecorder = FrameVideoRecorder  # type: ignore[misc]
-    sys.argv = [f"sb3-chdp {command}", *prepare_arguments(command, arguments)]
+    if command == "train":
+        from sb3_chdp.zoo_resume import prepare_training
+
+        # The arguments of a run that goes on are its own
+        resumed = any(argument.partition("=")[0] == "--resume" for argument in arguments)
+        try:
+            arguments = prepare_training(arguments if resumed else prepare_arguments(command, arguments))
+        except ValueError as error:
+            sys.exit(f"sb3-chdp train: {error}")
+    else:
+        arguments = prepare_arguments(command, arguments)
+    sys.argv = [f"sb3-chdp {command}", *arguments]
     runpy.run_module(SCRIPTS[command], run_name="__main__", alter_sys=True)
 
 

@@ -220,6 +220,12 @@ class HPPO(HybridAlgorithm, PPO):
         callback.on_rollout_end()
         return True
 
+    def dump_logs(self, iteration: int = 0) -> None:
+        if iteration > 0:
+            # A resumed run goes on counting, learn() begins at 1
+            iteration = (self.num_timesteps - self._num_timesteps_at_start) // (self.n_steps * self.n_envs)
+        super().dump_logs(iteration)
+
     def predict(
         self,
         observation: np.ndarray | dict[str, np.ndarray],
