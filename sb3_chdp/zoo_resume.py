@@ -33,7 +33,7 @@ class ResumableExperimentManager(HybridExperimentManager):
             self.continue_training = True
 
     def create_callbacks(self) -> None:
-        super().create_callbacks()
+        super().create_callbacks()  # type: ignore[no-untyped-call]
         if self.save_freq > 0 and not self.optimize_hyperparameters:
             if self.run is None:
                 # The seed may have been drawn; of two the last one counts
