@@ -48,7 +48,7 @@ def restore_model(model: BaseAlgorithm, state: dict[str, Any]) -> None:
         restore_state(module, state["modules"].get(name, {}))
 
 
-def _spaces(space: spaces.Space[Any]) -> Iterator[spaces.Space]:
+def _spaces(space: spaces.Space[Any]) -> Iterator[spaces.Space[Any]]:
     yield space
     parts = getattr(space, "spaces", ())
     for part in parts.values() if isinstance(parts, dict) else parts:
