@@ -6,9 +6,10 @@ import yaml
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
+from sb3_chdp import ALGORITHMS
 from sb3_chdp.cli import prepare_arguments
 from sb3_chdp.envs.recorder import FrameVideoRecorder
-from tests.test_zoo import HYPERPARAMS, TINY, run
+from tests.test_zoo import TINY, run
 
 pytest.importorskip("rl_zoo3")
 imageio = pytest.importorskip("imageio")
@@ -27,7 +28,7 @@ def test_an_id_with_a_slash(tmp_path):
     logs = tmp_path / "logs" / "chdp" / f"{FOLDER}_1"
     assert (logs / f"{FOLDER}.zip").is_file()
     config = dict(yaml.load((logs / FOLDER / "config.yml").read_text(), Loader=yaml.UnsafeLoader))
-    own = yaml.safe_load((HYPERPARAMS / "chdp.yml").read_text())["Platform-v0"]
+    own = yaml.safe_load(ALGORITHMS["chdp"].hyperparams.read_text())["Platform-v0"]
     assert config["n_random_candidates"] == own["n_random_candidates"], "the settings of Platform were used"
     assert "Mean reward" in run("enjoy", "--env", ENV_ID, "-f", "logs", "--no-render", "-n", "30", cwd=tmp_path)
     run("record", "--env", ENV_ID, "-f", "logs", "-n", "60", "-o", "videos", cwd=tmp_path)
