@@ -99,7 +99,7 @@ def main() -> None:
 
         from sb3_chdp.envs.recorder import FrameVideoRecorder
 
-        vec_env.VecVideoRecorder = FrameVideoRecorder  # type: ignore[misc]
+        vars(vec_env).update(VecVideoRecorder=FrameVideoRecorder)
     if command == "train":
         from sb3_chdp.zoo_resume import prepare_training
 

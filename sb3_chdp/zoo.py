@@ -18,10 +18,9 @@ def register() -> None:
         tuning = algorithm.load_tuning()
         if tuning is not None:
             HYPERPARAMS_SAMPLER[name], HYPERPARAMS_CONVERTER[name] = tuning
-    # rl_zoo3 evaluates replay_buffer_class and the like among its own imports: YAML files may name classes of this package
-    rl_zoo3.exp_manager.sb3_chdp = sb3_chdp  # type: ignore[attr-defined]
-    # Where rl_zoo3.train takes it from
-    rl_zoo3.exp_manager.ExperimentManager = HybridExperimentManager  # type: ignore[misc]
+    # rl_zoo3 evaluates replay_buffer_class and the like among its own imports: YAML files may name classes of this package.
+    # From there rl_zoo3.train takes its manager, too
+    vars(rl_zoo3.exp_manager).update(sb3_chdp=sb3_chdp, ExperimentManager=HybridExperimentManager)
 
 
 class HybridExperimentManager(ExperimentManager):

@@ -33,7 +33,7 @@ class ResumableExperimentManager(HybridExperimentManager):
             self.continue_training = True
 
     def create_callbacks(self) -> None:
-        super().create_callbacks()  # type: ignore[no-untyped-call]
+        super().create_callbacks()
         if self.save_freq > 0 and not self.optimize_hyperparameters:
             if self.run is None:
                 # The seed may have been drawn; of two the last one counts
@@ -93,5 +93,5 @@ def prepare_training(arguments: list[str]) -> list[str]:
         arguments = json.loads((run / ARGUMENTS).read_text())
     # The script constructs it
     ResumableExperimentManager.arguments, ResumableExperimentManager.run = arguments, run
-    rl_zoo3.exp_manager.ExperimentManager = ResumableExperimentManager  # type: ignore[misc]
+    vars(rl_zoo3.exp_manager).update(ExperimentManager=ResumableExperimentManager)
     return arguments

@@ -87,7 +87,7 @@ class RunManager(HybridExperimentManager):
         usual = Path(self.save_path)
         self._set_folder(folder)
         try:
-            self.create_log_folder()  # type: ignore[no-untyped-call]
+            self.create_log_folder()
             self.save_trained_model(model)
         finally:
             self._set_folder(usual)

@@ -122,7 +122,9 @@ class PrioritizedReplayBuffer(ReplayBuffer):
             parts = self._normalize_obs({key: part[index] for key, part in observations.items()}, env)
             assert isinstance(parts, dict)
             return {key: self.to_torch(part) for key, part in parts.items()}
-        return self.to_torch(self._normalize_obs(observations[index], env))  # type: ignore[arg-type]
+        part = self._normalize_obs(observations[index], env)
+        assert isinstance(part, np.ndarray)
+        return self.to_torch(part)
 
 
 class PrioritizedDictReplayBuffer(PrioritizedReplayBuffer, DictReplayBuffer):  # type: ignore[misc]

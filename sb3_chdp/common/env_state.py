@@ -163,7 +163,7 @@ def warn_of_losses(env: VecEnv) -> None:
             "The environment has no get_state() and set_state(): a resumed run begins with a fresh episode", stacklevel=2
         )
     known = (spaces.Space, gym.Env, ResultsWriter, type, type(None))
-    for wrapper in _wrappers((local_envs(env) or [None])[0]):  # type: ignore[list-item]
+    for wrapper in [wrapper for env in (local_envs(env) or [])[:1] for wrapper in _wrappers(env)]:
         lost = [
             name
             for name, value in vars(wrapper).items()

@@ -11,6 +11,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
@@ -92,8 +93,9 @@ class ResumableCheckpoint(BaseCallback):
         with tempfile.TemporaryFile(dir=self.save_path):
             pass
         self._store.lock()
-        if getattr(self.model, "replay_buffer", None) is not None:
-            buffer_state(self.model.replay_buffer)  # type: ignore[attr-defined]
+        buffer = _replay_buffer(self.model)
+        if buffer is not None:
+            buffer_state(buffer)
         save_env(self.training_env)
         if not run.pending:
             warn_of_losses(self.training_env)
@@ -179,8 +181,9 @@ class ResumableCheckpoint(BaseCallback):
                 f"Training goes on, the last checkpoint is {last}"
             )
             return
-        if getattr(self.model, "replay_buffer", None) is not None:
-            self._replay.commit(self.model.replay_buffer, folder, files)  # type: ignore[attr-defined]
+        buffer = _replay_buffer(self.model)
+        if buffer is not None:
+            self._replay.commit(buffer, folder, files)
         if self.verbose >= 2:
             print(f"Saving resumable checkpoint to {folder}")
 
@@ -254,9 +257,10 @@ def resume(directory: str | Path, env: GymEnv, device: th.device | str = "auto",
         raise ValueError(f"env must be wrapped in {state['vec_wrappers']} like the checkpoint, got {class_names(vec_env)}")
     model = algorithm.load(folder / "model.zip", env=vec_env, device=device, force_reset=False, **kwargs)
     restore_model(model, state["model"])
-    if "buffer" in state:
-        restore_state(model.replay_buffer, state["buffer"])  # type: ignore[attr-defined]
-        read_rows(model.replay_buffer, folder, state["rows_per_chunk"])  # type: ignore[attr-defined]
+    buffer = _replay_buffer(model)
+    if "buffer" in state and buffer is not None:
+        restore_state(buffer, state["buffer"])
+        read_rows(buffer, folder, state["rows_per_chunk"])
     vec_env.reset()
     restore_env(vec_env, state["env"])
     if state["env"]["states"] is None or not has_state(vec_env):
@@ -264,6 +268,10 @@ def resume(directory: str | Path, env: GymEnv, device: th.device | str = "auto",
     restore_generators(model, state["later"]["generators"])
     _RUNS[model] = _Run({Path(directory).resolve(): store}, state["later"])
     return model
+
+
+def _replay_buffer(model: BaseAlgorithm) -> ReplayBuffer | None:
+    return getattr(model, "replay_buffer", None)
 
 
 def _begin_episode(model: BaseAlgorithm) -> None:

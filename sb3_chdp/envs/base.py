@@ -187,9 +187,14 @@ class HybridEnv(gym.Env[np.ndarray, Any]):
             raise ValueError(f"render_mode must be 'rgb_array' for render_frames(), got {self.render_mode!r}")
         pictures = self._pictures
         if pictures is None:
-            pictures = [self.render()]  # type: ignore[list-item]
+            pictures = [self._picture()]
         self._pictures, self._pictures_wanted = [], True
         return pictures
+
+    def _picture(self) -> np.ndarray:
+        picture = self.render()
+        assert picture is not None
+        return picture
 
     @property
     def _is_watched(self) -> bool:
@@ -199,7 +204,7 @@ class HybridEnv(gym.Env[np.ndarray, Any]):
         """Show a frame to whoever watches; to be called after each, its outcome known."""
         self._outcome = outcome
         if self._pictures is not None:
-            self._pictures += [self.render()] * (1 + self.metadata["render_fps"] // 2 * bool(outcome))  # type: ignore[list-item]
+            self._pictures += [self._picture()] * (1 + self.metadata["render_fps"] // 2 * bool(outcome))
         if self.frame_callback is not None:
             self.frame_callback()
 

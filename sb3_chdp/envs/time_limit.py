@@ -7,6 +7,8 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import TimeLimit
 
+from sb3_chdp.envs.base import HybridEnv
+
 
 class StatefulTimeLimit(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
     """
@@ -24,9 +26,15 @@ class StatefulTimeLimit(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordCon
                 self._limit = env
             env = env.env
 
+    @property
+    def _simulator(self) -> HybridEnv:
+        env = self.env.unwrapped
+        assert isinstance(env, HybridEnv)
+        return env
+
     def get_state(self) -> dict[str, Any]:
         """:return: the environment's state, with ``elapsed_steps`` if there is a step limit"""
-        state = self.env.unwrapped.get_state()  # type: ignore[attr-defined]
+        state = self._simulator.get_state()
         # Gymnasium has no public name for the count
         return state if self._limit is None else {**state, "elapsed_steps": self._limit._elapsed_steps}
 
@@ -38,7 +46,7 @@ class StatefulTimeLimit(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordCon
         """
         state = dict(state)
         elapsed_steps = state.pop("elapsed_steps", None)
-        observation = self.env.unwrapped.set_state(state)  # type: ignore[attr-defined]
+        observation = self._simulator.set_state(state)
         if self._limit is not None and elapsed_steps is not None:
             self._limit._elapsed_steps = elapsed_steps
         return observation

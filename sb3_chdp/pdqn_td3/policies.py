@@ -140,12 +140,13 @@ class ParameterizedQNetwork(BaseModel):
         own_parameters = parameters.gather(1, index).view(len(parameters), *columns.shape[1:]) * self.parameter_mask[k]
         values = []
         for q_net in self.q_networks:
-            first, hidden, last = q_net[0], q_net[1:-1], q_net[-1]  # type: ignore[index]
+            first, *hidden, last = q_net.children()
+            assert isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
             state_part = F.linear(features, first.weight[:, : self.features_dim], first.bias)
             # (B, M, Pmax) x (B or 1, M, Pmax, units) -> (B, M, units)
             parameter_weights = first.weight[:, self.features_dim :].t()[columns]
             parameter_part = (own_parameters[..., None] * parameter_weights).sum(dim=2)
-            units = hidden(state_part[:, None] + parameter_part)
+            units = nn.Sequential(*hidden)(state_part[:, None] + parameter_part)
             values.append((units * last.weight[k]).sum(dim=2) + last.bias[k])
         q1, q2 = values
         return q1, q2
