@@ -17,7 +17,7 @@ from sb3_chdp.benchmark import figures, paper, tables
 from sb3_chdp.benchmark.paper import MAIN
 from sb3_chdp.benchmark.results import read_results
 from sb3_chdp.benchmark.runs import display_name
-from sb3_chdp.benchmark.statistics import cell_of, scores_of
+from sb3_chdp.benchmark.statistics import scores_of
 from sb3_chdp.registry import ALGORITHMS
 
 ROOT = Path(__file__).parent
@@ -49,16 +49,15 @@ def paper_column(row: str, env: str) -> str:
 
 
 def overview(scores: pd.DataFrame, rows: list[str], envs: list[str]) -> str:
-    """:return: a line per algorithm, a column per environment: mean and standard deviation of the score, paper in brackets"""
+    """:return: a line per environment: mean score of the first algorithm and of the best other one, and the paper's figure"""
+    first, *others = rows
+    means = scores.groupby(["env", "row"])["score"].mean()
     lines = []
-    for row in rows:
-        entries = []
-        for env in envs:
-            cell, published = cell_of(scores, row, env), paper.paper_column(row, env)
-            entry = "" if cell.empty else tables.mean_and_std(cell["score"].to_numpy())
-            entries.append(f"{entry} [{published}]" if published else entry)
-        lines.append([display_name(row), *entries])
-    return tables.markdown(["algorithm", *envs], lines)
+    for env in envs:
+        best = max((row for row in others if (env, row) in means), key=lambda row: means[env, row])
+        published = paper.paper_column(first, env).split()
+        lines.append([env, f"{means[env, first]:.1f}", f"{means[env, best]:.1f} ({display_name(best)})", *published[:1]])
+    return tables.markdown(["environment", display_name(first), "best baseline", f"{display_name(first)} in the paper"], lines)
 
 
 def main() -> None:
