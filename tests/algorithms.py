@@ -19,7 +19,10 @@ for name, line in REGISTRY.items():
     algorithm = line.load_class()
     SMALL[algorithm] = {**(OFF_POLICY if issubclass(algorithm, OffPolicyAlgorithm) else ON_POLICY), **OWN.get(name, {})}
 ALGORITHMS = list(SMALL)
-OFF_POLICY_ALGORITHMS = [algorithm for algorithm in ALGORITHMS if issubclass(algorithm, OffPolicyAlgorithm)]
+# PaperCHDP has no arguments of exploration; what it does instead is in test_chdp.py
+OFF_POLICY_ALGORITHMS = [
+    algorithm for algorithm in ALGORITHMS if issubclass(algorithm, OffPolicyAlgorithm) and algorithm is not PaperCHDP
+]
 LAYOUTS = list(layouts())
 
 

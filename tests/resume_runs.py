@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_chdp
 from sb3_chdp.common import checkpoint_store, replay_store
+from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.resume import ResumableCheckpoint, resume
 from tests.algorithms import make_model
 from tests.hybrid_envs import UNIT
@@ -80,7 +81,7 @@ def make_env(n_envs, folder=None, env_class=ResumableWalkEnv, normalize=False, v
 
 # Algorithm, number of environments and settings: each setting that has a state of its own is on in one of them
 RUNS = {
-    "CHDP-1": dict(prioritized_replay=True, policy_kwargs=dict(net_arch=[8], whitening=True)),
+    "CHDP-1": dict(replay_buffer_class=PrioritizedReplayBuffer, policy_kwargs=dict(net_arch=[8], whitening=True)),
     "CHDP-4": dict(n_steps=3),
     "HPPO-1": {},
     "HPPO-4": {},

@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNorm
 
 from sb3_chdp import CHDP, HPPO, PATD3
 from sb3_chdp.common import replay_store
+from sb3_chdp.common.buffers import PrioritizedDictReplayBuffer
 from sb3_chdp.common.checkpoint_store import DamagedError, GenerationWriter
 from sb3_chdp.common.plain_data import from_bytes, to_bytes
 from sb3_chdp.common.resume import ResumableCheckpoint, resume
@@ -392,7 +393,8 @@ def test_dict_observations(tmp_path):
             return {"x": super()._obs(), "n": 1}
 
     env = make_env(2, env_class=DictWalkEnv, normalize=False)
-    model = CHDP("MultiInputPolicy", env, prioritized_replay=True, buffer_size=50, learning_starts=10, seed=0)
+    settings = dict(replay_buffer_class=PrioritizedDictReplayBuffer, buffer_size=50, learning_starts=10, seed=0)
+    model = CHDP("MultiInputPolicy", env, **settings)
     model.learn(80, ResumableCheckpoint(10, tmp_path))
     buffer = resume(tmp_path, make_env(2, env_class=DictWalkEnv)).replay_buffer
     for name in ("observations", "next_observations"):

@@ -27,6 +27,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 import sb3_chdp
 from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3
+from sb3_chdp.common.buffers import PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
 from sb3_chdp.common.serialization import TAG, decode, encode
 from tests.algorithms import LAYOUTS, make_model
 from tests.hybrid_envs import make_layout_env
@@ -313,10 +314,10 @@ class MyBuffer(ReplayBuffer):
     "kwargs, observations",
     [
         ({}, None),
-        (dict(prioritized_replay=True), None),
+        (dict(replay_buffer_class=PrioritizedReplayBuffer), None),
         (dict(n_steps=3), None),
         (dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False)), None),
-        (dict(prioritized_replay=True), spaces.Dict(x=spaces.Box(-1, 1, (2,)), y=spaces.Discrete(3))),
+        (dict(replay_buffer_class=PrioritizedDictReplayBuffer), spaces.Dict(x=spaces.Box(-1, 1, (2,)), y=spaces.Discrete(3))),
         (dict(replay_buffer_class=MyBuffer), None),
     ],
     ids=["plain", "prioritized", "n_steps", "memory", "dict", "custom"],
