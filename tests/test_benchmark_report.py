@@ -1,8 +1,6 @@
 """Scores, tables and figures of any grid of algorithms and environments, and the published ones."""
 
-import importlib
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -164,15 +162,3 @@ def test_paper_command_trains_every_published_run():
     assert {run.eval_episodes for run in runs} == {100}
     (one,) = make_runs(parse(["paper", "--algos", "hppo", "--envs", "Goal-v0", "--seeds", "10", "--steps", "50"])[0])
     assert one.overrides == {"n_timesteps": 50}
-
-
-def test_ablations_differ_in_their_settings():
-    pytest.importorskip("submitit")
-    sys.path.insert(0, str(BENCHMARKS))
-    try:
-        ablations = importlib.import_module("ablations")
-    finally:
-        sys.path.remove(str(BENCHMARKS))
-    assert len({str(settings) for settings in ablations.VARIANTS.values()}) == len(ablations.VARIANTS)
-    assert {path.name for path in (RESULTS / "ablation").iterdir()} == set(ablations.VARIANTS)
-    assert ablations.paper_column("without_codebook", "HardMove6-v0") == "56.1 ± 12.5"

@@ -323,6 +323,8 @@ def go_on(folder):
 
 def test_folder_that_another_process_writes_to(tmp_path):
     trained(tmp_path)
+    # A lock of this process ends when any file of it is closed
+    gc.collect()
     model = go_on(tmp_path)
     for is_there in (True, False):
         process = PROCESSES.Process(target=go_on, args=(tmp_path,))
