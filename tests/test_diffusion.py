@@ -106,7 +106,6 @@ def test_chain_with_a_linear_denoiser_gives_the_analytic_gaussian():
     assert m == pytest.approx(mean, abs=0.02)
 
 
-@pytest.mark.slow
 def test_diffusion_loss_alone_recovers_two_modes():
     """Given condition +1 the data lie at -0.6 and +0.6, given -1 at 0 only."""
     th.manual_seed(0)

@@ -36,7 +36,6 @@ def success(model):
     return evaluate_policy(model, env, 200, deterministic=True)[0]
 
 
-@pytest.mark.slow
 def test_hybrid_identity(algorithm):
     env = make_vec_env(HybridIdentityEnv, 8, seed=0)
     model = algorithm("MlpPolicy", env, seed=0, gamma=0.0, **SETTINGS[algorithm])
@@ -44,7 +43,6 @@ def test_hybrid_identity(algorithm):
     assert success(model) > THRESHOLD
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("broken", ["critic ignores the latents", "no policy improvement"])
 def test_broken_chdp_fails(broken):
     """The threshold is out of reach without the parts that make the algorithm learn."""
@@ -64,7 +62,6 @@ def test_broken_chdp_fails(broken):
     assert success(model) < THRESHOLD - 0.2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("baseline", BASELINES, ids=lambda baseline: baseline.__name__)
 def test_broken_baselines_fail(baseline):
     """A critic that does not learn leads nowhere."""
