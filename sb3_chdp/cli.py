@@ -62,6 +62,8 @@ def prepare_arguments(command: str, arguments: list[str]) -> list[str]:
     if command == "optimize" and not {"-optimize", "--optimize-hyperparameters"} & set(arguments):
         arguments.append("--optimize-hyperparameters")
     algorithm = ALGORITHMS.get(_option(arguments, "--algo") or "")
+    if command == "optimize" and algorithm is not None and algorithm.tuning is None:
+        sys.exit(f"sb3-chdp optimize: {algorithm.name} has no Optuna sampler and cannot be tuned")
     if command in ("train", "optimize") and algorithm is not None:
         # In front, so that a -conf of the user wins; rl_zoo3 has the files of its own algorithms
         arguments = ["-conf", str(algorithm.hyperparams), *arguments]

@@ -5,7 +5,7 @@ import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_chdp import CHDP, HPPO, HyARTD3
+from sb3_chdp import CHDP, HPPO, HyARTD3, PaperCHDP
 from tests.algorithms import OFF_POLICY_ALGORITHMS
 from tests.hybrid_envs import HybridIdentityEnv
 
@@ -19,6 +19,7 @@ SETTINGS = {
         for baseline in OFF_POLICY_ALGORITHMS
     },
     CHDP: dict(n_diffusion_steps=5, gradient_steps=2, learning_starts=200, policy_kwargs=dict(net_arch=[64, 64])),
+    PaperCHDP: dict(n_diffusion_steps=5, gradient_steps=2, learning_starts=200, policy_kwargs=dict(net_arch=[64, 64])),
     HyARTD3: dict(
         gradient_steps=8,
         learning_rate=1e-3,
