@@ -12,13 +12,14 @@ from typing import ClassVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.torch_layers import create_mlp
+from stable_baselines3.common.torch_layers import create_mlp, get_actor_critic_arch
 from torch import nn
 
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import PaperCHDP
 from sb3_chdp.chdp.codebook import Codebook
 from sb3_chdp.chdp.diffusion import DiffusionModel
+from sb3_chdp.chdp.paper import PaperPolicy
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.samples import HybridReplaySamples
@@ -84,8 +85,8 @@ class OneHotCodebook(Codebook):
 class DeterministicPolicies(CHDPPolicy):
     """MLPs in place of both diffusion models."""
 
-    def _make_model(self, dim: int, condition_dim: int, net_arch: list[int]) -> DiffusionModel:
-        return DeterministicModel(dim, condition_dim, net_arch, self.activation_fn)
+    def _make_model(self, dim: int, condition_dim: int) -> DiffusionModel:
+        return DeterministicModel(dim, condition_dim, get_actor_critic_arch(self.net_arch)[0], self.activation_fn)
 
 
 class OneHotPolicy(CHDPPolicy):
@@ -128,20 +129,36 @@ class WithoutBoth(WithoutCodebook, WithoutSequentialUpdate):
     """:class:`WithoutCodebook` and :class:`WithoutSequentialUpdate`."""
 
 
+class PaperDeterministicPolicies(DeterministicPolicies, PaperPolicy):
+    """:class:`DeterministicPolicies` of the published algorithm."""
+
+
+class PaperOneHotPolicy(OneHotPolicy, PaperPolicy):
+    """:class:`OneHotPolicy` of the published algorithm."""
+
+
 class PaperWithoutDiffusion(WithoutDiffusion, PaperCHDP):
     """:class:`WithoutDiffusion` of the published algorithm."""
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": PaperDeterministicPolicies}
 
 
 class PaperWithoutCodebook(WithoutCodebook, PaperCHDP):
     """:class:`WithoutCodebook` of the published algorithm."""
 
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": PaperOneHotPolicy}
+
 
 class PaperWithoutSequentialUpdate(WithoutSequentialUpdate, PaperCHDP):
     """:class:`WithoutSequentialUpdate` of the published algorithm."""
 
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = PaperCHDP.policy_aliases
+
 
 class PaperWithoutBoth(WithoutBoth, PaperCHDP):
     """:class:`WithoutBoth` of the published algorithm."""
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": PaperOneHotPolicy}
 
 
 @dataclass(frozen=True)

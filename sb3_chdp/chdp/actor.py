@@ -1,53 +1,43 @@
 """The two cooperating policies of CHDP with the codebook between them."""
 
-from typing import Any
-
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.policies import BaseModel
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
 
 from sb3_chdp.chdp.codebook import Codebook
+from sb3_chdp.chdp.critic import BilinearReads
 from sb3_chdp.chdp.diffusion import DiffusionModel
 from sb3_chdp.common.hybrid_box import HybridBox
 
 
-class CooperativeActor(BaseModel):
+class CooperativeActor(nn.Module):
     """
     The two agents of the cooperative game.
 
     The discrete policy draws a latent e, the codebook decodes it to k and e_k, and the continuous policy, conditioned on
     the state and e_k, draws the parameters.
 
-    :param observation_space: observation space
     :param action_space: space of the action rows
-    :param features_extractor: network to extract features, the same for both agents
     :param codebook: quantises the latents
     :param discrete_policy: model of the latents given the features
-    :param continuous_policy: model of the parameters given the features and a codeword
-    :param normalize_images: whether to divide images by 255
+    :param continuous_policy: model of the parameters given :meth:`condition`
+    :param reads: what else the continuous policy sees of the features, as the critics do; None: nothing
     """
 
-    features_extractor: BaseFeaturesExtractor
     parameter_mask: th.Tensor
 
     def __init__(
         self,
-        observation_space: spaces.Space[Any],
         action_space: HybridBox,
-        features_extractor: BaseFeaturesExtractor,
         codebook: Codebook,
         discrete_policy: DiffusionModel,
         continuous_policy: DiffusionModel,
-        normalize_images: bool = True,
+        reads: BilinearReads | None = None,
     ):
-        super().__init__(
-            observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
-        )
+        super().__init__()
         self.codebook = codebook
         self.discrete_policy = discrete_policy
         self.continuous_policy = continuous_policy
+        self.reads = reads
         mask = action_space.spec.mask
         self._has_padding = not bool(mask.all())
         # Not needed when no action has padding, and then not kept: K may be 65,536
@@ -55,9 +45,10 @@ class CooperativeActor(BaseModel):
             "parameter_mask", th.tensor(mask if self._has_padding else mask[:1], dtype=th.float32), persistent=False
         )
 
-    def features(self, obs: PyTorchObs) -> th.Tensor:
-        """:return: (B, features_dim) features of the observations"""
-        return self.extract_features(obs, self.features_extractor)
+    @property
+    def device(self) -> th.device:
+        """Where the networks are"""
+        return self.codebook.codewords.device
 
     def mask(self, k: th.Tensor) -> th.Tensor | None:
         """:return: (B, Pmax) 1 for the parameters that action k has, None if no action has padding"""
@@ -72,6 +63,15 @@ class CooperativeActor(BaseModel):
         latents = self.discrete_policy.sample(features, noise=noise)
         return latents, self.codebook.quantize(latents)
 
+    def condition(self, features: th.Tensor, codewords: th.Tensor) -> th.Tensor:
+        """
+        :param features: (B, features_dim)
+        :param codewords: (B, latent_dim)
+        :return: (B, condition_dim) what the continuous policy is conditioned on
+        """
+        reads = [] if self.reads is None else [self.reads(features, codewords)]
+        return th.cat([features, codewords, *reads], dim=1)
+
     def sample_parameters(self, features: th.Tensor, k: th.Tensor, noise: th.Tensor | None = None) -> th.Tensor:
         """
         :param features: (B, features_dim)
@@ -79,7 +79,7 @@ class CooperativeActor(BaseModel):
         :param noise: noise of the continuous policy's chain, drawn if None
         :return: (B, Pmax) parameters in [-1, 1], padding 0; their gradient reaches the codewords of k
         """
-        condition = th.cat([features, self.codebook(k)], dim=1)
+        condition = self.condition(features, self.codebook(k))
         return self.continuous_policy.sample(condition, self.mask(k), noise)
 
     def random_actions(self, *shape: int, generator: th.Generator | None = None) -> tuple[th.Tensor, th.Tensor, th.Tensor]:

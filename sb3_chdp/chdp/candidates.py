@@ -1,6 +1,6 @@
-"""Candidates: several actions per observation, of which the critics choose one."""
+"""Selection: several actions per observation, of which the critics choose one."""
 
-import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch as th
@@ -8,10 +8,24 @@ import torch as th
 from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.critic import HybridCritic
 
-# Number of noise chains that repeatable candidates choose from
-FIXED_NOISE_CHAINS = 1024
 # Standard deviations of the changes of the parameters in successive refinements
 REFINEMENT_SPREADS = (0.1, 0.03)
+
+
+class SelectedActions(NamedTuple):
+    """
+    A hybrid action for each of B observations.
+
+    :ivar latents: (B, latent_dim)
+    :ivar discrete_actions: (B,)
+    :ivar parameters: (B, Pmax), padding 0
+    :ivar q_values: (B, 1) their min(Q1, Q2)
+    """
+
+    latents: th.Tensor
+    discrete_actions: th.Tensor
+    parameters: th.Tensor
+    q_values: th.Tensor
 
 
 class Candidates(NamedTuple):
@@ -32,56 +46,44 @@ class Candidates(NamedTuple):
         batch_size = len(self.latents)
         return Candidates(*(th.cat([a, b.expand(batch_size, *b.shape[1:])], dim=1) for a, b in zip(self, others, strict=True)))
 
-    def best(self, critic: HybridCritic, features: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
+    def best(self, critic: HybridCritic, features: th.Tensor) -> SelectedActions:
         """
         :param critic: twin critic
-        :param features: (B, features_dim) its features of the observations
-        :return: latents (B, latent_dim), discrete actions (B,), parameters (B, Pmax) and min(Q1, Q2) (B, 1) of the candidates
-            for which the latter is highest
+        :param features: (B, features_dim) features of the observations
+        :return: the candidates of highest min(Q1, Q2)
         """
         batch_size, n = self.discrete_actions.shape
         latents, k, parameters = (part.flatten(0, 1) for part in self)
         q_values = th.min(*critic.q_values(features.repeat_interleave(n, dim=0), latents, parameters))
         best = q_values.view(batch_size, n).argmax(dim=1) + th.arange(batch_size, device=features.device) * n
-        return latents[best], k[best], parameters[best], q_values[best]
+        return SelectedActions(latents[best], k[best], parameters[best], q_values[best])
 
 
-def policy_candidates(
-    actor: CooperativeActor,
-    features: th.Tensor,
-    n: int,
-    uniform_fraction: float,
-    hashes: th.Tensor | None = None,
-    fixed_noise: tuple[th.Tensor, th.Tensor] | None = None,
+def drawn_candidates(
+    actor: CooperativeActor, features: th.Tensor, n: int, n_uniform: int, noise: tuple[th.Tensor, th.Tensor] | None = None
 ) -> Candidates:
     """
-    Actions that the policies draw.
+    Actions that the policies draw, and others of which the continuous policy draws the parameters alone.
 
     :param actor: the policies
-    :param features: (B, features_dim) their features of the observations
-    :param n: number of actions per observation
-    :param uniform_fraction: share of them, rounded up, but never all, with successive discrete actions from a random one on
-        instead: all discrete actions if there are no more
-    :param hashes: (B,) numbers that decide everything random, taken from ``fixed_noise``; None: draw
-    :param fixed_noise: ``FIXED_NOISE_CHAINS`` noises for the chains of latents and parameters
+    :param features: (B, features_dim) features of the observations
+    :param n: number of actions per observation that both policies draw
+    :param n_uniform: number of further actions, of successive discrete actions from a random one on: each once if there are
+        no more
+    :param noise: noises of the chains of latents (N, B * n, latent_dim) and of parameters (N, B * (n_uniform + n), Pmax);
+        None: draw
     """
-    batch_size, device = features.shape[0], features.device
-    n_uniform = min(math.ceil(uniform_fraction * n), n - 1)
-    latent_noise = parameter_noise = None
-    if hashes is not None and fixed_noise is not None:
-        chains = (hashes[:, None] + th.arange(n, device=device)) % FIXED_NOISE_CHAINS
-        latent_noise = fixed_noise[0][..., chains[:, n_uniform:].flatten(), :]
-        parameter_noise = fixed_noise[1][..., chains.flatten(), :]
-    latents, k = actor.sample_latents(features.repeat_interleave(n - n_uniform, dim=0), latent_noise)
-    latents, k = latents.view(batch_size, n - n_uniform, -1), k.view(batch_size, -1)
+    batch_size, codebook, device = len(features), actor.codebook, features.device
+    latent_noise, parameter_noise = (None, None) if noise is None else noise
+    latents, k = actor.sample_latents(features.repeat_interleave(n, dim=0), latent_noise)
+    latents, k = latents.view(batch_size, n, -1), k.view(batch_size, n)
     if n_uniform > 0:
-        if hashes is None:
-            hashes = th.randint(2**31, (batch_size,), device=device)
-        uniform_k = (hashes[:, None] + th.arange(n_uniform, device=device)) % actor.codebook.n_discrete_actions
-        latents = th.cat([actor.codebook.representative_latents(uniform_k), latents], dim=1)
-        k = th.cat([uniform_k, k], dim=1)
-    parameters = actor.sample_parameters(features.repeat_interleave(n, dim=0), k.flatten(), parameter_noise)
-    return Candidates(latents, k, parameters.view(batch_size, n, -1))
+        first = th.randint(codebook.n_discrete_actions, (batch_size, 1), device=device) if noise is None else 0
+        uniform_k = (first + th.arange(n_uniform, device=device)) % codebook.n_discrete_actions
+        uniform_k = uniform_k.expand(batch_size, n_uniform)
+        latents, k = th.cat([codebook.representative_latents(uniform_k), latents], dim=1), th.cat([uniform_k, k], dim=1)
+    parameters = actor.sample_parameters(features.repeat_interleave(n + n_uniform, dim=0), k.flatten(), parameter_noise)
+    return Candidates(latents, k, parameters.view(batch_size, n + n_uniform, -1))
 
 
 def random_candidates(actor: CooperativeActor, batch_size: int, n: int, repeatable: bool) -> Candidates:
@@ -98,23 +100,60 @@ def random_candidates(actor: CooperativeActor, batch_size: int, n: int, repeatab
     return Candidates(*actor.random_actions(batch_size, n))
 
 
-def varied_candidates(
-    actor: CooperativeActor, latents: th.Tensor, k: th.Tensor, parameters: th.Tensor, n: int, spread: float
-) -> Candidates:
+def varied_candidates(actor: CooperativeActor, actions: SelectedActions, n: int, spread: float) -> Candidates:
     """
     Actions and n Gaussian variations of the parameters of each, always the same ones.
 
     :param actor: the policies
-    :param latents: (B, latent_dim)
-    :param k: (B,) discrete actions
-    :param parameters: (B, Pmax)
+    :param actions: actions of B observations
     :param n: number of variations per action
     :param spread: their standard deviation
     :return: candidates of B observations, the given action first, n + 1 in all
     """
+    latents, k, parameters, _ = actions
     noise = th.randn(1, n, parameters.shape[1], generator=th.Generator().manual_seed(0)).to(parameters.device)
     mask = actor.mask(k)
     varied = (parameters[:, None] + spread * (noise if mask is None else noise * mask[:, None])).clamp(-1, 1)
     return Candidates(
         latents[:, None].expand(-1, n + 1, -1), k[:, None].expand(-1, n + 1), th.cat([parameters[:, None], varied], dim=1)
     )
+
+
+@dataclass(frozen=True)
+class Selection:
+    """
+    A rule which actions compete. The one of highest min(Q1, Q2) is taken.
+
+    :param n_drawn: number of actions per observation that both policies draw
+    :param n_uniform: number of uniformly random discrete actions with parameters of the continuous policy
+    :param n_random: number of uniformly random actions
+    :param n_refined: number of variations of the parameters of the best of all these, in each of two rounds with standard
+        deviations of ``REFINEMENT_SPREADS`` of the scaled parameters
+    """
+
+    n_drawn: int
+    n_uniform: int = 0
+    n_random: int = 0
+    n_refined: int = 0
+
+    def __call__(
+        self,
+        actor: CooperativeActor,
+        critic: HybridCritic,
+        features: th.Tensor,
+        noise: tuple[th.Tensor, th.Tensor] | None = None,
+    ) -> SelectedActions:
+        """
+        :param actor: the policies
+        :param critic: the critics that choose
+        :param features: (B, features_dim) features of the observations
+        :param noise: all that is random in the draws, see :func:`drawn_candidates`; random actions are the same every time
+            then. None: draw
+        """
+        candidates = drawn_candidates(actor, features, self.n_drawn, self.n_uniform, noise)
+        if self.n_random > 0:
+            candidates = candidates.join(random_candidates(actor, len(features), self.n_random, noise is not None))
+        best = candidates.best(critic, features)
+        for spread in REFINEMENT_SPREADS if self.n_refined > 0 else ():
+            best = varied_candidates(actor, best, self.n_refined, spread).best(critic, features)
+        return best

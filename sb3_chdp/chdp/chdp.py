@@ -4,24 +4,28 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import update_learning_rate
+from stable_baselines3.common.utils import LinearSchedule, update_learning_rate
 
 from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.codebook import codebook_usage
 from sb3_chdp.chdp.critic import HybridCritic
-from sb3_chdp.chdp.exploration import vary_parts
-from sb3_chdp.chdp.losses import continuous_policy_loss, critic_loss, discrete_policy_loss, relabel_latents
+from sb3_chdp.chdp.exploration import exploration_rate, vary_parts
+from sb3_chdp.chdp.losses import continuous_policy_loss, critic_loss, discrete_policy_loss, relabel_latents, target_values
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
-from sb3_chdp.common.buffers import PrioritizedReplayBuffer
-from sb3_chdp.common.checks import check_at_least, check_fraction
+from sb3_chdp.common.buffers import PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
+from sb3_chdp.common.checks import check_at_least
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.samples import HybridReplaySamples
 from sb3_chdp.common.utils import TargetUpdate, gradient_step
+
+# By default
+LEARNING_RATE = LinearSchedule(1e-3, 0.0, 1.0)
 
 
 class CHDP(HybridOffPolicyAlgorithm):
@@ -35,24 +39,25 @@ class CHDP(HybridOffPolicyAlgorithm):
     Paper: Liu et al., "CHDP: Cooperative Hybrid Diffusion Policies for Reinforcement Learning in Parameterized Action
     Space", AAAI 2026. No reference code is published.
 
+    The defaults need no tuning: observations, rewards and parameters may have any units.
+
     :class:`PaperCHDP` is the algorithm as published. Differences from it:
-        1. the action of highest Q among ``n_action_candidates`` draws acts, see also ``n_random_candidates`` and
-           ``n_refinement_candidates``;
-        2. random actions with a decreasing probability, see ``exploration_initial_eps`` and ``explore_parts``;
-        3. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
-           stored ones;
-        4. the continuous policy is improved for uniformly random discrete actions too, some of which are among the
-           candidates, see ``uniform_fraction``;
-        5. latents from the buffer that no longer decode to the action taken give way to its present codeword, see
-           ``train/latent_drift``;
-        6. the critics' loss can train the codebook, which makes many discrete actions learnable, see
-           ``critics_train_codebook``;
-        7. transitions of large TD error can be replayed more often, with
-           ``replay_buffer_class=``:class:`PrioritizedReplayBuffer`.
+        1. observations are normalised, see :class:`NormalizedExtractor`, and values, see :class:`ValueScale`;
+        2. critics have layer normalisation, a state value of their own and bilinear reads, see :class:`QNetwork`;
+        3. the critics' loss trains the codebook too, so that actions of similar effect get similar codewords; latents from
+           the buffer that no longer decode to the action taken give way to its present codeword, see ``train/latent_drift``;
+        4. of several actions the one of highest Q acts, and of two next actions the better counts, see :class:`Selection`;
+        5. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
+           stored ones, and the continuous policy for uniformly random discrete actions too;
+        6. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate` and
+           :func:`vary_parts`;
+        7. transitions of large TD error are replayed more often, see :class:`PrioritizedReplayBuffer`;
+        8. the learning rate falls linearly to 0, and policies and targets are updated every second time.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str), with a hybrid action space
     :param learning_rate: learning rate of all networks; it can be a function of the current progress remaining (from 1 to 0)
+        (by default it falls linearly from 1e-3 to 0)
     :param buffer_size: size of the replay buffer
     :param learning_starts: how many steps of the model to collect transitions for before learning starts
     :param batch_size: Minibatch size for each gradient update
@@ -61,35 +66,19 @@ class CHDP(HybridOffPolicyAlgorithm):
     :param train_freq: Update the model every ``train_freq`` steps, or a tuple like ``(5, "step")`` or ``(2, "episode")``
     :param gradient_steps: How many gradient steps to do after each rollout; ``-1``: as many as steps done in the environment
     :param action_noise: noise on the scaled parameters, of size Pmax (None by default: the policies are stochastic)
-    :param replay_buffer_class: Replay buffer class to use. If ``None``, it will be automatically selected.
+    :param replay_buffer_class: Replay buffer class to use. If ``None``: :class:`PrioritizedReplayBuffer` where it can be used,
+        else SB3's (``n_steps`` > 1 or ``optimize_memory_usage``)
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer at a cost of more complexity.
     :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the critics.
     :param latent_dim: width d_e of the latent and of a codeword
     :param n_diffusion_steps: number N of denoising steps of both policies
     :param eta: weight of the policy improvement terms relative to the diffusion losses
-    :param uniform_fraction: share of uniformly random discrete actions for which the continuous policy is improved, and of
-        those among the candidates
-    :param n_action_candidates: number of actions drawn per observation to act; that of highest target min(Q1, Q2) is taken
-    :param n_random_candidates: number of uniformly random actions that compete with these: a search for what the critics value
-        and the policies have not found; best with ``layer_norm`` of :class:`CHDPPolicy` (0: the paper)
-    :param n_refinement_candidates: number of variations of the best of these that compete with it in deterministic
-        predictions, in each of two rounds, see :class:`CHDPPolicy`: for parameters that have to be exact (0: the paper)
-    :param n_target_candidates: number of next actions drawn per transition for the target of the critics, chosen from in
-        the same way (1: the paper)
-    :param codebook_lr_factor: learning rate of the codebook relative to that of the networks; the faster it moves, the
-        more stored latents decode to other actions (``train/latent_drift``)
-    :param critics_train_codebook: whether the critics' loss trains the codebook too, so that actions of similar effect get
-        similar codewords; best with ``codebook_lr_factor=1`` (no effect without a codebook)
-    :param max_grad_norm: bound on the gradient norm of every network, None for none
+    :param codebook_lr_factor: learning rate of the codebook relative to that of the networks
+    :param n_action_candidates: number of actions that both policies draw per observation to act, beside others that compete
     :param policy_delay: policies and targets are updated once every ``policy_delay`` critic updates
     :param action_layout: how to read an ambiguous action space, "auto", "per_action" or "shared",
         see :class:`HybridActionSpec`
-    :param explore_parts: whether exploration also varies the discrete action or the parameters alone, see
-        :func:`vary_parts`; otherwise all exploratory actions are uniformly random
-    :param exploration_fraction: fraction of the training over which the rate of uniformly random actions is reduced
-    :param exploration_initial_eps: initial probability of a uniformly random action
-    :param exploration_final_eps: final probability of a uniformly random action
     :param stats_window_size: number of episodes over which the logged success rate, length and reward are averaged
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments to be passed to the policy on creation, see :class:`CHDPPolicy`
@@ -104,6 +93,15 @@ class CHDP(HybridOffPolicyAlgorithm):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
+    # Share of uniformly random discrete actions for which the continuous policy is improved
+    uniform_fraction: ClassVar[float] = 0.5
+    # Whether the critics' loss trains the codebook
+    critics_train_codebook: ClassVar[bool] = True
+    # Whether the critics work in units of their own, see ValueScale
+    scales_values: ClassVar[bool] = True
+    # Bound on the gradient norm of every network
+    max_grad_norm: ClassVar[float | None] = None
+
     policy: CHDPPolicy
     actor: CooperativeActor
     actor_target: CooperativeActor
@@ -114,7 +112,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         self,
         policy: str | type[CHDPPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = 1e-3,
+        learning_rate: float | Schedule = LEARNING_RATE,
         buffer_size: int = 1_000_000,  # 1e6
         learning_starts: int = 500,
         batch_size: int = 128,
@@ -127,23 +125,13 @@ class CHDP(HybridOffPolicyAlgorithm):
         replay_buffer_kwargs: dict[str, Any] | None = None,
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
-        latent_dim: int = 8,
-        n_diffusion_steps: int = 15,
+        latent_dim: int = 32,
+        n_diffusion_steps: int = 5,
         eta: float = 10.0,
-        uniform_fraction: float = 0.25,
-        n_action_candidates: int = 16,
-        n_random_candidates: int = 0,
-        n_refinement_candidates: int = 0,
-        n_target_candidates: int = 1,
-        codebook_lr_factor: float = 0.1,
-        critics_train_codebook: bool = False,
-        max_grad_norm: float | None = 1.0,
-        policy_delay: int = 1,
+        codebook_lr_factor: float = 1.0,
+        n_action_candidates: int = 8,
+        policy_delay: int = 2,
         action_layout: str = "auto",
-        explore_parts: bool = False,
-        exploration_fraction: float = 0.2,
-        exploration_initial_eps: float = 1.0,
-        exploration_final_eps: float = 0.05,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -169,9 +157,6 @@ class CHDP(HybridOffPolicyAlgorithm):
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
             action_layout=action_layout,
-            exploration_fraction=exploration_fraction,
-            exploration_initial_eps=exploration_initial_eps,
-            exploration_final_eps=exploration_final_eps,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             policy_kwargs=policy_kwargs,
@@ -179,43 +164,36 @@ class CHDP(HybridOffPolicyAlgorithm):
             seed=seed,
             device=device,
         )
-        check_fraction(uniform_fraction=uniform_fraction)
         check_at_least(1, latent_dim=latent_dim, n_diffusion_steps=n_diffusion_steps, policy_delay=policy_delay)
-        check_at_least(1, n_action_candidates=n_action_candidates, n_target_candidates=n_target_candidates)
-        check_at_least(0, n_random_candidates=n_random_candidates, n_refinement_candidates=n_refinement_candidates)
+        check_at_least(1, n_action_candidates=n_action_candidates)
         self.latent_dim = latent_dim
         self.n_diffusion_steps = n_diffusion_steps
         self.eta = eta
-        self.uniform_fraction = uniform_fraction
-        self.n_action_candidates = n_action_candidates
-        self.n_random_candidates = n_random_candidates
-        self.n_refinement_candidates = n_refinement_candidates
-        self.n_target_candidates = n_target_candidates
         self.codebook_lr_factor = codebook_lr_factor
-        self.critics_train_codebook = critics_train_codebook
-        self.max_grad_norm = max_grad_norm
+        self.n_action_candidates = n_action_candidates
         self.policy_delay = policy_delay
-        self.explore_parts = explore_parts
 
         if _init_setup_model:
             self._setup_model()
 
     def _network_kwargs(self) -> dict[str, Any]:
-        return dict(
-            n_diffusion_steps=self.n_diffusion_steps,
-            n_action_candidates=self.n_action_candidates,
-            n_random_candidates=self.n_random_candidates,
-            n_refinement_candidates=self.n_refinement_candidates,
-            uniform_fraction=self.uniform_fraction,
-        )
+        return dict(n_diffusion_steps=self.n_diffusion_steps, n_action_candidates=self.n_action_candidates)
 
     def _make_hybrid_space(self) -> HybridBox:
         return HybridBox(self.action_space, self.action_layout, self.latent_dim)
 
     def _setup_model(self) -> None:
+        if self.replay_buffer_class is None:
+            self.replay_buffer_class = self._default_replay_buffer_class()
         super()._setup_model()
         self._create_aliases()
         self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
+
+    def _default_replay_buffer_class(self) -> type[ReplayBuffer] | None:
+        if self.n_steps > 1 or self.optimize_memory_usage:
+            return None
+        is_dict = isinstance(self.observation_space, spaces.Dict)
+        return PrioritizedDictReplayBuffer if is_dict else PrioritizedReplayBuffer
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -237,33 +215,34 @@ class CHDP(HybridOffPolicyAlgorithm):
             self._n_updates += 1
             replay_data, drift = self._latents_of_today(self._sample_batch(batch_size))
 
-            # Step 0: critics, eq. 10, and the codebook if they train it
-            loss, q_values, errors = critic_loss(policy, replay_data, self.n_target_candidates)
+            # Step 0: critics, eq. 10 and 11, and the codebook if they train it
+            targets = target_values(policy, replay_data)
+            if self.scales_values:
+                policy.rescale_values(targets)
+            features = policy.critic.features(replay_data.observations)
+            loss, q_values, errors = critic_loss(policy, replay_data, features, policy.value_scale.outputs(targets))
             gradient_step(loss, critic_optimizers, self.max_grad_norm)
             policy.actor.codebook.project()
             if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
                 assert replay_data.indices is not None, "a prioritised buffer says where its samples are"
                 self.replay_buffer.update_priorities(replay_data.indices, errors)
-            losses = {"critic_loss": loss, "q_mean": q_values.mean(), "latent_drift": drift}
+            q_mean = policy.value_scale.values(q_values).mean()
+            losses = {"critic_loss": loss, "q_mean": q_mean, "latent_drift": drift}
 
             if self._n_updates % self.policy_delay == 0:
                 alpha = self.eta / q_values.abs().mean().clamp(min=1e-6)
-                features = policy.actor_features(replay_data.observations)
-                with th.no_grad():
-                    critic_features = self.critic.features(replay_data.observations)
+                features = features.detach()
 
                 # Step 1: discrete policy, eq. 7
                 parameters = self._parameters_of_latents(replay_data)
-                diffusion_loss, q_loss = discrete_policy_loss(policy, replay_data, features, critic_features, parameters)
+                diffusion_loss, q_loss = discrete_policy_loss(policy, replay_data, features, parameters)
                 loss = diffusion_loss + alpha * q_loss
                 gradient_step(loss, [policy.discrete_optimizer], self.max_grad_norm)
                 losses |= {"discrete_loss": loss, "diffusion_loss_discrete": diffusion_loss}
 
-                # Step 2: continuous policy and codebook, eq. 8, given the updated discrete policy; the features extractor
-                # belongs to step 1
-                features = features.detach()
+                # Step 2: continuous policy and codebook, eq. 8, given the updated discrete policy
                 latents, k = self._actions_to_improve(replay_data, features)
-                diffusion_loss, q_loss = continuous_policy_loss(policy, replay_data, features, critic_features, latents, k)
+                diffusion_loss, q_loss = continuous_policy_loss(policy, replay_data, features, latents, k)
                 loss = diffusion_loss + alpha * q_loss
                 gradient_step(loss, [policy.continuous_optimizer, policy.codebook_optimizer], self.max_grad_norm)
                 policy.actor.codebook.project()
@@ -292,7 +271,7 @@ class CHDP(HybridOffPolicyAlgorithm):
     def _actions_to_improve(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         :param replay_data: a batch
-        :param features: (B, features_dim) features of the policies, without gradient
+        :param features: (B, features_dim) features of the observations, without gradient
         :return: latents (B, latent_dim) and discrete actions (B,) whose parameters are improved: those of the discrete policy,
             and uniformly random ones for a share of ``uniform_fraction`` of the batch
         """
@@ -304,11 +283,26 @@ class CHDP(HybridOffPolicyAlgorithm):
                 latents, k = th.cat([uniform_latents, latents]), th.cat([uniform_k, k])
         return latents, k
 
+    def _exploration_rate(self) -> float:
+        return exploration_rate(self.num_timesteps, self._episode_num, self.hybrid_space.spec.n_discrete_actions)
+
     def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        if not self.explore_parts:
-            return super()._exploratory_rows(rows, rng)
         assert self._last_obs is not None, "self._last_obs was not set"
         return vary_parts(self.policy, self._last_obs, rows, rng)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        if self.scales_values:
+            timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
+            self.policy.value_scale.count_transitions(reward, dones & ~timeouts, self.gamma)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _update_learning_rates(self) -> None:
         """Set the learning rates of all optimizers according to their schedules."""

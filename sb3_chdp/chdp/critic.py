@@ -2,15 +2,15 @@
 
 from typing import Any
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_chdp.common.checks import check_at_least
+# Chebyshev polynomials of the parameters that the critics see
+PARAMETER_DEGREE = 2
 
 
 def chebyshev_features(x: th.Tensor, degree: int) -> th.Tensor:
@@ -28,84 +28,127 @@ def chebyshev_features(x: th.Tensor, degree: int) -> th.Tensor:
     return th.cat(polynomials[1:], dim=1) if degree > 1 else x
 
 
-class HybridCritic(ContinuousCritic):
+class BilinearReads(nn.Module):
     """
-    SB3's twin critic Q(s, latent, parameters), with the features of the state computed once for several calls.
+    What a latent e reads of a vector x: e^T W_j x for j = 1 to ``n_reads``.
 
-    :param observation_space: observation space
+    A discrete action often concerns a part of the state, its channel or its product. An MLP on [x, e] has to learn for each
+    action which part that is; a read finds it by a product, for all actions with the same W_j.
+
+    :param n_inputs: width of x
+    :param latent_dim: width of the latent
+    :param n_reads: number of reads
+    """
+
+    def __init__(self, n_inputs: int, latent_dim: int, n_reads: int):
+        super().__init__()
+        self.n_reads, self.latent_dim = n_reads, latent_dim
+        self.maps = nn.Linear(n_inputs, n_reads * latent_dim, bias=False)
+        # Unit variance for x of unit variance and latents uniform in [-1, 1]
+        nn.init.normal_(self.maps.weight, std=(3 / (n_inputs * latent_dim)) ** 0.5)
+
+    def forward(self, x: th.Tensor, latents: th.Tensor) -> th.Tensor:
+        """
+        :param x: (B, n_inputs)
+        :param latents: (B, latent_dim)
+        :return: (B, n_reads)
+        """
+        return th.bmm(self.maps(x).view(-1, self.n_reads, self.latent_dim), latents[:, :, None])[:, :, 0]
+
+
+class QNetwork(nn.Module):
+    """
+    Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a, with layer normalisation, which bounds Q where there
+    is no data (Ball et al., 2023). A sees polynomials of the parameters and bilinear reads of all by the latent.
+
+    V and A are not told apart further: V learns what does not depend on the action (as in Wang et al., 2016).
+
+    :param features_dim: number of features of the state
     :param latent_dim: width of the latent
     :param n_parameters: number of parameters
-    :param net_arch: hidden layers
-    :param features_extractor: network to extract features
-    :param features_dim: number of features
+    :param net_arch: hidden layers of A; V has one of half the width of the first
     :param activation_fn: activation function
-    :param normalize_images: whether to divide images by 255
-    :param layer_norm: whether every hidden layer is followed by layer normalisation, which bounds Q where there is no data
-        (Ball et al., 2023)
-    :param parameter_degree: highest degree of the Chebyshev polynomials of the parameters that the networks see, see
-        :func:`chebyshev_features`
-    :param bilinear: whether the networks see the products of all entries of the latent with all parameters as well: what a
-        parameter does depends on the discrete action, often by a factor
-    :raises ValueError: if ``parameter_degree`` is less than 1
+    :param n_reads: number of bilinear reads
     """
 
     def __init__(
         self,
-        observation_space: spaces.Space[Any],
+        features_dim: int,
         latent_dim: int,
         n_parameters: int,
         net_arch: list[int],
-        features_extractor: BaseFeaturesExtractor,
-        features_dim: int,
-        activation_fn: type[nn.Module] = nn.ReLU,
-        normalize_images: bool = True,
-        layer_norm: bool = False,
-        parameter_degree: int = 1,
-        bilinear: bool = False,
+        activation_fn: type[nn.Module],
+        n_reads: int,
     ):
-        check_at_least(1, parameter_degree=parameter_degree)
-        action_dim = latent_dim + n_parameters * (parameter_degree + latent_dim * bilinear)
+        super().__init__()
+        normalize: list[type[nn.Module]] = [nn.LayerNorm]
+        n_inputs = features_dim + n_parameters * PARAMETER_DEGREE
+        self.reads = BilinearReads(n_inputs, latent_dim, n_reads)
+        value_arch = [width // 2 for width in net_arch[:1]]
+        self.value = nn.Sequential(*create_mlp(features_dim, 1, value_arch, activation_fn, post_linear_modules=normalize))
+        n_inputs += latent_dim + n_reads
+        self.advantage = nn.Sequential(*create_mlp(n_inputs, 1, net_arch, activation_fn, post_linear_modules=normalize))
+
+    def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+        """:return: (B, 1) values"""
+        x = th.cat([features, chebyshev_features(parameters, PARAMETER_DEGREE)], dim=1)
+        advantages = self.advantage(th.cat([x, latents, self.reads(x, latents)], dim=1))
+        return self.value(features) + advantages
+
+    def rescale(self, factor: float) -> None:
+        """Multiply the values by a factor."""
+        with th.no_grad():
+            for net in (self.value, self.advantage):
+                net[-1].weight.mul_(factor)
+                net[-1].bias.mul_(factor)
+
+
+class HybridCritic(BaseModel):
+    """
+    Twin critic Q(s, latent, parameters), with the features of the state computed once for several calls.
+
+    :param observation_space: observation space
+    :param action_space: space of the action rows
+    :param features_extractor: network to extract features
+    :param q_networks: two networks of features, latents and parameters
+    :param normalize_images: whether to divide images by 255
+    """
+
+    features_extractor: BaseFeaturesExtractor
+    optimizer: th.optim.Optimizer
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Box,
+        features_extractor: BaseFeaturesExtractor,
+        q_networks: list[nn.Module],
+        normalize_images: bool = True,
+    ):
         super().__init__(
-            observation_space,
-            spaces.Box(-np.inf, np.inf, (action_dim,)),
-            net_arch,
-            features_extractor,
-            features_dim,
-            activation_fn=activation_fn,
-            normalize_images=normalize_images,
-            n_critics=2,
-            share_features_extractor=False,
+            observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
         )
-        self.parameter_degree = parameter_degree
-        self.bilinear = bilinear
-        if layer_norm:
-            for i in range(self.n_critics):
-                modules: list[type[nn.Module]] = [nn.LayerNorm]
-                q_net = create_mlp(features_dim + action_dim, 1, net_arch, activation_fn, post_linear_modules=modules)
-                self.q_networks[i] = nn.Sequential(*q_net)
-                self.add_module(f"qf{i}", self.q_networks[i])
+        self.q_networks = nn.ModuleList(q_networks)
 
     def features(self, obs: PyTorchObs) -> th.Tensor:
         """:return: (B, features_dim) features of the observations"""
         return self.extract_features(obs, self.features_extractor)
-
-    def _q_input(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-        parts = [features, latents, chebyshev_features(parameters, self.parameter_degree)]
-        if self.bilinear:
-            parts.append((latents[:, :, None] * parameters[:, None, :]).flatten(1))
-        return th.cat(parts, dim=1)
 
     def q_values(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         :param features: (B, features_dim) from :meth:`features`
         :param latents: (B, latent_dim)
         :param parameters: (B, n_parameters) scaled parameters
-        :return: Q1 and Q2, each (B, 1)
+        :return: Q1 and Q2, each (B, 1), in the units of :class:`ValueScale`
         """
-        q_input = self._q_input(features, latents, parameters)
-        q1, q2 = (q_net(q_input) for q_net in self.q_networks)
+        q1, q2 = (q_net(features, latents, parameters) for q_net in self.q_networks)
         return q1, q2
 
     def q1_values(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
         """:return: (B, 1) Q1 alone, see :meth:`q_values`"""
-        return self.q_networks[0](self._q_input(features, latents, parameters))
+        return self.q_networks[0](features, latents, parameters)
+
+    def rescale(self, factor: float) -> None:
+        """Multiply the values by a factor."""
+        for q_net in self.q_networks:
+            q_net.rescale(factor)

@@ -1,12 +1,31 @@
-"""Exploration of the parts of a hybrid action, each on its own."""
+"""When and how CHDP explores: a rate that follows from the task, and the parts of a hybrid action varied each on its own."""
 
 import numpy as np
 import torch as th
 
 from sb3_chdp.chdp.policies import CHDPPolicy
 
+# After so many steps, and some for each discrete action, every second action still explores
+HALF_LIFE, HALF_LIFE_PER_ACTION = 2000, 10
+# Explored actions of an episode that always remain, unless that is more than a share of all
+ACTIONS_PER_EPISODE, MAX_FINAL_RATE = 2.0, 0.3
 # Smallest and largest standard deviation of the noise on scaled parameters
 NOISE_SCALES = (0.03, 1.0)
+
+
+def exploration_rate(n_steps: int, n_episodes: int, n_discrete_actions: int) -> float:
+    """
+    The rate falls with the number n of steps as n0 / (n0 + n), n0 = ``HALF_LIFE`` + K ``HALF_LIFE_PER_ACTION``, whatever the
+    length of the training; ``ACTIONS_PER_EPISODE`` of an episode keep exploring.
+
+    :param n_steps: steps so far
+    :param n_episodes: episodes so far
+    :param n_discrete_actions: number K of discrete actions
+    :return: probability of an exploratory action
+    """
+    half_life = HALF_LIFE + HALF_LIFE_PER_ACTION * n_discrete_actions
+    final = min(ACTIONS_PER_EPISODE * n_episodes / max(n_steps, 1), MAX_FINAL_RATE)
+    return max(half_life / (half_life + n_steps), final)
 
 
 def reflect(x: np.ndarray) -> np.ndarray:
@@ -19,10 +38,11 @@ def random_parameters(rng: np.random.Generator, mask: np.ndarray) -> np.ndarray:
     """
     :param rng: random generator
     :param mask: (n, Pmax) 1 for the parameters that exist
-    :return: (n, Pmax) scaled parameters, each a bound with probability 1/2 (where good actions often lie), else uniform in
-        between; padding 0
+    :return: (n, Pmax) scaled parameters, padding 0: half of the rows uniformly random; in the others each parameter is a bound
+        with probability 1/2 (where good actions often lie), else uniform in between
     """
-    return np.clip(rng.uniform(-2, 2, mask.shape), -1, 1) * mask
+    reach = np.where(rng.random((len(mask), 1)) < 0.5, 2.0, 1.0)
+    return np.clip(reach * rng.uniform(-1, 1, mask.shape), -1, 1) * mask
 
 
 def vary_parts(
@@ -49,7 +69,7 @@ def vary_parts(
     random = policy.random_rows(rng, n)
     of_random_k = random.copy()
     with th.no_grad():
-        features = policy.actor.features(policy.obs_to_tensor(observation)[0])
+        features = policy.critic_target.features(policy.obs_to_tensor(observation)[0])
         k = th.as_tensor(columns.discrete_actions(random), device=policy.device)
         columns.view(of_random_k, "parameters")[:] = policy.actor.sample_parameters(features, k).cpu().numpy()
 

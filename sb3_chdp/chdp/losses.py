@@ -1,7 +1,6 @@
 """The losses of CHDP, one function for each of the paper's equations, and the relabelling of stored latents."""
 
 import torch as th
-from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.samples import HybridReplaySamples
@@ -23,75 +22,64 @@ def relabel_latents(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> tup
 
 
 @th.no_grad()
-def next_state_values(policy: CHDPPolicy, next_obs: PyTorchObs, n_candidates: int) -> th.Tensor:
+def target_values(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> th.Tensor:
     """
-    :param policy: the networks
-    :param next_obs: B next observations
-    :param n_candidates: number of next actions that the target policies draw per observation, of which the best counts
-    :return: (B, 1) min(Q1, Q2) of the target critics
-    """
-    actor, critic = policy.actor_target, policy.critic_target
-    *_, q_values = policy.best_candidate(actor, actor.features(next_obs), critic.features(next_obs), n_candidates)
-    return q_values
-
-
-def critic_loss(
-    policy: CHDPPolicy, replay_data: HybridReplaySamples, n_target_candidates: int
-) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-    """
-    Eq. 10, (Q_j(s, e, a) - y)^2, with the target of eq. 11, y = r + gamma min_j Q'_j(s', e', a'); weighted if the replay is
-    prioritised. It has a gradient for the codebook, which may be used.
+    Eq. 11, y = r + gamma min_j Q'_j(s', e', a') of the best next action (e', a') among a few of the target policies.
 
     :param policy: the networks
     :param replay_data: a batch
-    :param n_target_candidates: number of next actions drawn per transition, see :func:`next_state_values`
-    :return: their sum over both critics, the detached (B, 1) values of the first, and the larger (B,) absolute error of both
+    :return: (B, 1) y in the units of the rewards
     """
-    next_q_values = next_state_values(policy, replay_data.next_observations, n_target_candidates)
-    target_q_values = replay_data.rewards + (1 - replay_data.dones) * replay_data.discounts * next_q_values
-    features = policy.critic.features(replay_data.observations)
+    features = policy.critic_target.features(replay_data.next_observations)
+    next_actions = policy.select_target(policy.actor_target, policy.critic_target, features)
+    next_values = policy.value_scale.values(next_actions.q_values)
+    return replay_data.rewards + (1 - replay_data.dones) * replay_data.discounts * next_values
+
+
+def critic_loss(
+    policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, targets: th.Tensor
+) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+    """
+    Eq. 10, (Q_j(s, e, a) - y)^2, weighted if the replay is prioritised. It has a gradient for the codebook, which may be used.
+
+    :param policy: the networks
+    :param replay_data: a batch
+    :param features: (B, features_dim) features of the observations
+    :param targets: (B, 1) targets y in the units of the critics
+    :return: sum over both critics, the detached (B, 1) values of the first, and the larger (B,) absolute error of both
+    """
     # The gradient with respect to a latent is also that of its codeword, as if the one moved with the other
     codewords = policy.actor.codebook(replay_data.discrete_actions)
     latents = replay_data.latents + (codewords - codewords.detach())
     q1, q2 = policy.critic.q_values(features, latents, replay_data.parameters)
-    errors = th.cat([q1, q2], dim=1) - target_q_values
+    errors = th.cat([q1, q2], dim=1) - targets
     loss = (replay_data.weights * errors.square()).sum(dim=1).mean()
     return loss, q1.detach(), errors.detach().abs().amax(dim=1)
 
 
 def discrete_policy_loss(
-    policy: CHDPPolicy,
-    replay_data: HybridReplaySamples,
-    actor_features: th.Tensor,
-    critic_features: th.Tensor,
-    parameters: th.Tensor | None = None,
+    policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, parameters: th.Tensor | None = None
 ) -> tuple[th.Tensor, th.Tensor]:
     """
     Eq. 7, L_d - alpha Q1(s, e, a): Q of latents e drawn through the whole chain.
 
     :param policy: the networks
     :param replay_data: a batch
-    :param actor_features: (B, features_dim) features of the policies
-    :param critic_features: (B, features_dim) features of the critics
+    :param features: (B, features_dim) features of the observations, without gradient
     :param parameters: (B, Pmax) parameters a of the drawn latents; None: those that the continuous policy draws for them
     :return: diffusion loss L_d and policy improvement loss -Q1
     """
-    discrete_policy = policy.actor.discrete_policy
-    diffusion_loss = discrete_policy.diffusion_loss(replay_data.latents, actor_features)
-    latents = discrete_policy.sample(actor_features)
+    actor = policy.actor
+    diffusion_loss = actor.discrete_policy.diffusion_loss(replay_data.latents, features)
+    latents = actor.discrete_policy.sample(features)
     if parameters is None:
         with th.no_grad():
-            parameters = policy.actor.sample_parameters(actor_features, policy.actor.codebook.quantize(latents))
-    return diffusion_loss, -policy.critic.q1_values(critic_features, latents, parameters).mean()
+            parameters = actor.sample_parameters(features, actor.codebook.quantize(latents))
+    return diffusion_loss, -policy.critic.q1_values(features, latents, parameters).mean()
 
 
 def continuous_policy_loss(
-    policy: CHDPPolicy,
-    replay_data: HybridReplaySamples,
-    actor_features: th.Tensor,
-    critic_features: th.Tensor,
-    latents: th.Tensor,
-    k: th.Tensor,
+    policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, latents: th.Tensor, k: th.Tensor
 ) -> tuple[th.Tensor, th.Tensor]:
     """
     Eq. 8, L_d - alpha Q1(s, e, a): Q of parameters a drawn through the whole chain; the gradient reaches the codebook through
@@ -99,14 +87,13 @@ def continuous_policy_loss(
 
     :param policy: the networks
     :param replay_data: a batch
-    :param actor_features: (B, features_dim) features of the policies
-    :param critic_features: (B, features_dim) features of the critics
+    :param features: (B, features_dim) features of the observations, without gradient
     :param latents: (B, latent_dim) latents e, without gradient
     :param k: (B,) discrete actions that they decode to
     :return: diffusion loss L_d and policy improvement loss -Q1
     """
     actor, stored_k = policy.actor, replay_data.discrete_actions
-    condition = th.cat([actor_features, actor.codebook(stored_k).detach()], dim=1)
+    condition = actor.condition(features, actor.codebook(stored_k).detach())
     diffusion_loss = actor.continuous_policy.diffusion_loss(replay_data.parameters, condition, actor.mask(stored_k))
-    parameters = actor.sample_parameters(actor_features, k)
-    return diffusion_loss, -policy.critic.q1_values(critic_features, latents, parameters).mean()
+    parameters = actor.sample_parameters(features, k)
+    return diffusion_loss, -policy.critic.q1_values(features, latents, parameters).mean()

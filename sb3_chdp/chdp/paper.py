@@ -1,14 +1,78 @@
 """Cooperative Hybrid Diffusion Policies as published."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, create_mlp, get_actor_critic_arch
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from torch import nn
 
+from sb3_chdp.chdp.actor import CooperativeActor
+from sb3_chdp.chdp.candidates import Selection
 from sb3_chdp.chdp.chdp import CHDP
+from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.policies import CHDPPolicy
+from sb3_chdp.common.policies import CnnFeatures, CombinedFeatures
 from sb3_chdp.common.samples import HybridReplaySamples
+
+
+class PaperQNetwork(nn.Module):
+    """
+    MLP Q(s, e, a).
+
+    :param n_inputs: number of features, latent entries and parameters
+    :param net_arch: hidden layers
+    :param activation_fn: activation function
+    """
+
+    def __init__(self, n_inputs: int, net_arch: list[int], activation_fn: type[nn.Module]):
+        super().__init__()
+        self.mlp = nn.Sequential(*create_mlp(n_inputs, 1, net_arch, activation_fn))
+
+    def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+        """:return: (B, 1) values"""
+        return self.mlp(th.cat([features, latents, parameters], dim=1))
+
+
+class PaperPolicy(CHDPPolicy):
+    """
+    :class:`CHDPPolicy` with plain networks, observations as they are, and one draw per action.
+
+    :param args: those of :class:`CHDPPolicy`
+    :param kwargs: those of :class:`CHDPPolicy`
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **{"features_extractor_class": FlattenExtractor, **kwargs})
+
+    def _make_critic(self, extractor: BaseFeaturesExtractor) -> HybridCritic:
+        n_inputs = extractor.features_dim + self.action_space.latent_dim + self.action_space.spec.max_parameters
+        critic_arch = get_actor_critic_arch(self.net_arch)[1]
+        q_networks: list[nn.Module] = [PaperQNetwork(n_inputs, critic_arch, self.activation_fn) for _ in range(2)]
+        return HybridCritic(self.observation_space, self.action_space, extractor, q_networks, self.normalize_images)
+
+    def _make_actor(self, features_dim: int) -> CooperativeActor:
+        spec, latent_dim = self.action_space.spec, self.action_space.latent_dim
+        return CooperativeActor(
+            self.action_space,
+            self._make_codebook(spec.n_discrete_actions, latent_dim),
+            self._make_model(latent_dim, features_dim),
+            self._make_model(spec.max_parameters, features_dim + latent_dim),
+        )
+
+    def _make_selections(self, n_discrete_actions: int) -> tuple[Selection, Selection, Selection]:
+        one = Selection(n_drawn=1)
+        return one, one, one
+
+
+class PaperCnnPolicy(CnnFeatures, PaperPolicy):
+    """:class:`PaperPolicy` for images."""
+
+
+class PaperMultiInputPolicy(CombinedFeatures, PaperPolicy):
+    """:class:`PaperPolicy` for dict observations."""
 
 
 class PaperCHDP(CHDP):
@@ -48,6 +112,16 @@ class PaperCHDP(CHDP):
     :param device: Device (cpu, cuda, ...) on which the code should be run; auto: the GPU if possible
     :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": PaperPolicy,
+        "CnnPolicy": PaperCnnPolicy,
+        "MultiInputPolicy": PaperMultiInputPolicy,
+    }
+    uniform_fraction: ClassVar[float] = 0.0
+    critics_train_codebook: ClassVar[bool] = False
+    scales_values: ClassVar[bool] = False
+    max_grad_norm: ClassVar[float | None] = 1.0
 
     def __init__(
         self,
@@ -92,12 +166,10 @@ class PaperCHDP(CHDP):
             latent_dim=latent_dim,
             n_diffusion_steps=n_diffusion_steps,
             eta=eta,
-            uniform_fraction=0.0,
-            n_action_candidates=1,
             codebook_lr_factor=codebook_lr_factor,
+            n_action_candidates=1,
+            policy_delay=1,
             action_layout=action_layout,
-            exploration_initial_eps=0.0,
-            exploration_final_eps=0.0,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             policy_kwargs=policy_kwargs,
@@ -113,3 +185,9 @@ class PaperCHDP(CHDP):
 
     def _parameters_of_latents(self, replay_data: HybridReplaySamples) -> th.Tensor | None:
         return replay_data.parameters
+
+    def _default_replay_buffer_class(self) -> type[ReplayBuffer] | None:
+        return None
+
+    def _exploration_rate(self) -> float:
+        return 0.0

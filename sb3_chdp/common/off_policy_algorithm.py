@@ -181,7 +181,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         if self.num_timesteps < learning_starts:
             rows = self.policy.random_rows(rng, n_envs)
             return rows, rows
-        explores = rng.random(n_envs) < self.exploration_schedule(self._current_progress_remaining)
+        explores = rng.random(n_envs) < self._exploration_rate()
         noise = self._draw_noise(n_envs) if action_noise is None else action_noise()
         if noise is not None and np.size(noise) != n_envs * self.policy.noise_dim:
             raise ValueError(
@@ -194,6 +194,10 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         if explores.any():
             rows[explores] = self._exploratory_rows(rows, rng)[explores]
         return rows, rows
+
+    def _exploration_rate(self) -> float:
+        """:return: probability that exploration takes the place of the policy"""
+        return self.exploration_schedule(self._current_progress_remaining)
 
     def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """
@@ -211,7 +215,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
 
     def _on_step(self) -> None:
         super()._on_step()
-        self.logger.record("rollout/exploration_rate", self.exploration_schedule(self._current_progress_remaining))
+        self.logger.record("rollout/exploration_rate", self._exploration_rate())
 
     def _sample_batch(self, batch_size: int) -> HybridReplaySamples:
         assert self.replay_buffer is not None
