@@ -26,6 +26,8 @@ from sb3_chdp.common.utils import TargetUpdate, gradient_step
 
 # By default
 LEARNING_RATE = LinearSchedule(1e-3, 0.0, 1.0)
+# Transitions from which the critics' first units are estimated
+WARM_UP_SAMPLES = 4096
 
 
 class CHDP(HybridOffPolicyAlgorithm):
@@ -210,6 +212,10 @@ class CHDP(HybridOffPolicyAlgorithm):
         if self.critics_train_codebook:
             critic_optimizers.append(policy.codebook_optimizer)
 
+        if self.scales_values and self._n_updates == 0:
+            warm_up = self._sample_batch(WARM_UP_SAMPLES)
+            policy.value_scale.start(warm_up.rewards, (1 - warm_up.dones) * warm_up.discounts)
+
         logs: dict[str, list[th.Tensor]] = {}
         for _ in range(gradient_steps):
             self._n_updates += 1
@@ -289,20 +295,6 @@ class CHDP(HybridOffPolicyAlgorithm):
     def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         assert self._last_obs is not None, "self._last_obs was not set"
         return vary_parts(self.policy, self._last_obs, rows, rng)
-
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        if self.scales_values:
-            timeouts = np.array([info.get("TimeLimit.truncated", False) for info in infos])
-            self.policy.value_scale.count_transitions(reward, dones & ~timeouts, self.gamma)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _update_learning_rates(self) -> None:
         """Set the learning rates of all optimizers according to their schedules."""

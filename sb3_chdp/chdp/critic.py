@@ -11,6 +11,7 @@ from torch import nn
 
 # Chebyshev polynomials of the parameters that the critics see
 PARAMETER_DEGREE = 2
+PRODUCTS = True
 
 
 def chebyshev_features(x: th.Tensor, degree: int) -> th.Tensor:
@@ -86,21 +87,23 @@ class QNetwork(nn.Module):
         self.reads = BilinearReads(n_inputs, latent_dim, n_reads)
         value_arch = [width // 2 for width in net_arch[:1]]
         self.value = nn.Sequential(*create_mlp(features_dim, 1, value_arch, activation_fn, post_linear_modules=normalize))
-        n_inputs += latent_dim + n_reads
+        n_inputs += latent_dim * (1 + n_parameters * PRODUCTS) + n_reads
         self.advantage = nn.Sequential(*create_mlp(n_inputs, 1, net_arch, activation_fn, post_linear_modules=normalize))
 
     def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
         """:return: (B, 1) values"""
         x = th.cat([features, chebyshev_features(parameters, PARAMETER_DEGREE)], dim=1)
-        advantages = self.advantage(th.cat([x, latents, self.reads(x, latents)], dim=1))
+        products = [(latents[:, :, None] * parameters[:, None]).flatten(1)] if PRODUCTS else []
+        advantages = self.advantage(th.cat([x, latents, self.reads(x, latents), *products], dim=1))
         return self.value(features) + advantages
 
-    def rescale(self, factor: float) -> None:
-        """Multiply the values by a factor."""
-        with th.no_grad():
-            for net in (self.value, self.advantage):
-                net[-1].weight.mul_(factor)
-                net[-1].bias.mul_(factor)
+    @th.no_grad()
+    def rescale(self, factor: float, summand: float) -> None:
+        """Multiply the values by a factor and add a number."""
+        for net in (self.value, self.advantage):
+            net[-1].weight.mul_(factor)
+            net[-1].bias.mul_(factor)
+        self.value[-1].bias.add_(summand)
 
 
 class HybridCritic(BaseModel):
@@ -148,7 +151,7 @@ class HybridCritic(BaseModel):
         """:return: (B, 1) Q1 alone, see :meth:`q_values`"""
         return self.q_networks[0](features, latents, parameters)
 
-    def rescale(self, factor: float) -> None:
-        """Multiply the values by a factor."""
+    def rescale(self, factor: float, summand: float) -> None:
+        """Multiply the values by a factor and add a number."""
         for q_net in self.q_networks:
-            q_net.rescale(factor)
+            q_net.rescale(factor, summand)

@@ -211,9 +211,9 @@ class CHDPPolicy(HybridPolicy):
 
         :param targets: (B, 1) targets of the critics, in the units of the rewards
         """
-        factor = self.value_scale.count_targets(targets)
+        factor, summand = self.value_scale.update(targets)
         for critic in (self.critic, self.critic_target):
-            critic.rescale(factor)
+            critic.rescale(factor, summand)
 
     def set_training_mode(self, mode: bool) -> None:
         """

@@ -1,11 +1,10 @@
-"""The units of the critics: values of unit size, whatever the rewards."""
+"""The units of the critics: values of zero mean and unit size, whatever the rewards."""
 
-import numpy as np
 import torch as th
 from torch import nn
 
-# Weights in the running means of a batch, and of a transition that comes in; more at first, when they are plain averages
-MIN_BATCH_WEIGHT, MIN_TRANSITION_WEIGHT = 0.005, 1e-4
+# Weight of a batch in the statistics; more at first, when they are plain averages
+MIN_UPDATE_WEIGHT = 0.005
 # Rewards of endless tasks without discount have no mean value
 MIN_TERMINATION = 1e-3
 MIN_SCALE = 1e-8
@@ -13,60 +12,57 @@ MIN_SCALE = 1e-8
 
 class ValueScale(nn.Module):
     """
-    Values are ``center + scale * output`` of the critics.
+    Values are ``center + scale * output`` of the critics: mean and standard deviation of the targets so far. When these
+    change, the critics' last layers do as well, so that values stay (PopArt, van Hasselt et al., 2016).
 
-    The center is the value of a policy that earns the mean reward for ever, E[r] / (1 - gamma (1 - E[termination])), of the
-    transitions as they come in: it depends neither on the critics, whose errors it would take up and feed back, nor on what
-    the replay prefers. The scale is the root mean square of the targets' distance from it (as in PopArt, van Hasselt et al.,
-    2016); when it changes, the critics' last layers do as well, so that values stay.
+    At first the center is the value of earning the mean reward of the warm-up for ever, so that the critics need not climb
+    there target by target.
     """
 
-    mean_reward: th.Tensor
-    mean_termination: th.Tensor
-    n_transitions: th.Tensor
     center: th.Tensor
-    mean_square: th.Tensor
+    variance: th.Tensor
     n_batches: th.Tensor
 
     def __init__(self) -> None:
         super().__init__()
-        for name in ("mean_reward", "mean_termination", "n_transitions", "center", "n_batches"):
+        for name in ("center", "variance", "n_batches"):
             self.register_buffer(name, th.zeros((), dtype=th.float64))
-        self.register_buffer("mean_square", th.ones((), dtype=th.float64))
+        self.variance += 1
 
     @property
     def scale(self) -> th.Tensor:
         """:return: () difference of values for a difference of 1 in the output"""
-        return self.mean_square.sqrt().clamp(min=MIN_SCALE)
+        return self.variance.sqrt().clamp(min=MIN_SCALE)
 
     def values(self, outputs: th.Tensor) -> th.Tensor:
         """:return: values in the units of the rewards"""
-        return self.center.float() + self.scale.float() * outputs
+        return (self.center + self.scale * outputs.double()).float()
 
     def outputs(self, values: th.Tensor) -> th.Tensor:
         """:return: what critics put out for the values"""
-        return (values - self.center.float()) / self.scale.float()
-
-    def count_transitions(self, rewards: np.ndarray, terminations: np.ndarray, gamma: float) -> None:
-        """
-        :param rewards: (n,) rewards of transitions that come in
-        :param terminations: (n,) whether they end an episode, other than by a time limit
-        :param gamma: discount factor
-        """
-        self.n_transitions += len(rewards)
-        weight = (len(rewards) / self.n_transitions).clamp(min=min(len(rewards) * MIN_TRANSITION_WEIGHT, 1.0))
-        for mean, value in ((self.mean_reward, rewards.mean()), (self.mean_termination, terminations.mean())):
-            mean += weight * (float(value) - mean)
-        self.center.copy_(self.mean_reward / (1 - gamma * (1 - self.mean_termination)).clamp(min=MIN_TERMINATION))
+        return ((values.double() - self.center) / self.scale).float()
 
     @th.no_grad()
-    def count_targets(self, targets: th.Tensor) -> float:
+    def start(self, rewards: th.Tensor, discounts: th.Tensor) -> None:
+        """
+        :param rewards: (B, 1) rewards of the warm-up
+        :param discounts: (B, 1) discounts of the next values, 0 where there are none
+        """
+        self.center.copy_(rewards.double().mean() / (1 - discounts.double().mean()).clamp(min=MIN_TERMINATION))
+
+    @th.no_grad()
+    def update(self, targets: th.Tensor) -> tuple[float, float]:
         """
         :param targets: (B, 1) targets of the critics, in the units of the rewards
-        :return: factor by which the critics' outputs have to be multiplied, so that the values stay what they were
+        :return: factor and summand for the critics' outputs, so that the values stay what they were
         """
-        before, first = self.scale, self.n_batches == 0
+        center, scale, first = self.center.clone(), self.scale, self.n_batches == 0
         self.n_batches += 1
-        weight = (1 / self.n_batches).clamp(min=MIN_BATCH_WEIGHT)
-        self.mean_square.lerp_((targets - self.center).double().square().mean(), weight)
-        return 1.0 if first else float(before / self.scale)
+        weight = (1 / self.n_batches).clamp(min=MIN_UPDATE_WEIGHT)
+        shift = targets.double().mean() - center
+        variance = targets.double().var(correction=0)
+        self.variance.lerp_(variance + (1 - weight) * shift.square(), weight)
+        if first:
+            return 1.0, 0.0
+        self.center += weight * shift
+        return float(scale / self.scale), float((center - self.center) / self.scale)
