@@ -101,6 +101,7 @@ class CHDP(HybridOffPolicyAlgorithm):
     critics_train_codebook: ClassVar[bool] = True
     # Whether the critics work in units of their own, see ValueScale
     scales_values: ClassVar[bool] = True
+    filters: ClassVar[bool] = True
     # Bound on the gradient norm of every network
     max_grad_norm: ClassVar[float | None] = None
 
@@ -241,14 +242,16 @@ class CHDP(HybridOffPolicyAlgorithm):
 
                 # Step 1: discrete policy, eq. 7
                 parameters = self._parameters_of_latents(replay_data)
-                diffusion_loss, q_loss = discrete_policy_loss(policy, replay_data, features, parameters)
+                diffusion_loss, q_loss, weights = discrete_policy_loss(policy, replay_data, features, parameters, q_values if self.filters else None)
                 loss = diffusion_loss + alpha * q_loss
                 gradient_step(loss, [policy.discrete_optimizer], self.max_grad_norm)
                 losses |= {"discrete_loss": loss, "diffusion_loss_discrete": diffusion_loss}
+                if weights is not None:
+                    losses["imitated"] = weights.mean()
 
                 # Step 2: continuous policy and codebook, eq. 8, given the updated discrete policy
                 latents, k = self._actions_to_improve(replay_data, features)
-                diffusion_loss, q_loss = continuous_policy_loss(policy, replay_data, features, latents, k)
+                diffusion_loss, q_loss = continuous_policy_loss(policy, replay_data, features, latents, k, weights)
                 loss = diffusion_loss + alpha * q_loss
                 gradient_step(loss, [policy.continuous_optimizer, policy.codebook_optimizer], self.max_grad_norm)
                 policy.actor.codebook.project()

@@ -58,8 +58,12 @@ def critic_loss(
 
 
 def discrete_policy_loss(
-    policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, parameters: th.Tensor | None = None
-) -> tuple[th.Tensor, th.Tensor]:
+    policy: CHDPPolicy,
+    replay_data: HybridReplaySamples,
+    features: th.Tensor,
+    parameters: th.Tensor | None = None,
+    q_values: th.Tensor | None = None,
+) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
     """
     Eq. 7, L_d - alpha Q1(s, e, a): Q of latents e drawn through the whole chain.
 
@@ -70,16 +74,18 @@ def discrete_policy_loss(
     :return: diffusion loss L_d and policy improvement loss -Q1
     """
     actor = policy.actor
-    diffusion_loss = actor.discrete_policy.diffusion_loss(replay_data.latents, features)
     latents = actor.discrete_policy.sample(features)
     if parameters is None:
         with th.no_grad():
             parameters = actor.sample_parameters(features, actor.codebook.quantize(latents))
-    return diffusion_loss, -policy.critic.q1_values(features, latents, parameters).mean()
+    improved = policy.critic.q1_values(features, latents, parameters)
+    weights = None if q_values is None else (q_values >= improved.detach()).float()
+    diffusion_loss = actor.discrete_policy.diffusion_loss(replay_data.latents, features, weights=weights)
+    return diffusion_loss, -improved.mean(), weights
 
 
 def continuous_policy_loss(
-    policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, latents: th.Tensor, k: th.Tensor
+    policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, latents: th.Tensor, k: th.Tensor, weights: th.Tensor | None = None
 ) -> tuple[th.Tensor, th.Tensor]:
     """
     Eq. 8, L_d - alpha Q1(s, e, a): Q of parameters a drawn through the whole chain; the gradient reaches the codebook through
@@ -94,6 +100,6 @@ def continuous_policy_loss(
     """
     actor, stored_k = policy.actor, replay_data.discrete_actions
     condition = actor.condition(features, actor.codebook(stored_k).detach())
-    diffusion_loss = actor.continuous_policy.diffusion_loss(replay_data.parameters, condition, actor.mask(stored_k))
+    diffusion_loss = actor.continuous_policy.diffusion_loss(replay_data.parameters, condition, actor.mask(stored_k), weights)
     parameters = actor.sample_parameters(features, k)
     return diffusion_loss, -policy.critic.q1_values(features, latents, parameters).mean()

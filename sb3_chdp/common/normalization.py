@@ -25,32 +25,36 @@ RESOLUTION, MIN_VARIANCE = 3e-7, 1e-12
 
 class RunningNormalization(nn.Module):
     """
-    Vectors z of zero mean and unit variance, and beside them whitened: W z, whose entries are nearly uncorrelated as well.
+    Vectors twice: centered and divided by one number, and whitened.
 
-    What decides is often a small difference of two entries, as the place of a ball relative to the player that runs with it.
-    Networks learn little of directions in which their inputs hardly vary; whitened, most vary alike. W is
-    (covariance of z + ``SHRINKAGE``)^(-1/2): among all whitening matrices the one that keeps entries closest to the original
-    ones (ZCA, Kessy et al., 2018), so that it changes little when the statistics do. These are averages over training batches,
-    in buffers whose names begin with ``running_``, as in batch normalisation: targets take over a copy.
+    The first copy keeps what entries of the same unit have in common: the place of a thing can be compared to that of another.
+    It shows little of an entry in a small unit. The second copy does: entries are divided by their standard deviations and
+    multiplied by W, after which they are nearly uncorrelated as well. What decides is often a small difference of two entries,
+    as the place of a ball relative to the player that runs with it, and networks learn little of directions in which their
+    inputs hardly vary. W is (correlation + ``SHRINKAGE``)^(-1/2): among all whitening matrices the one that keeps entries
+    closest to the original ones (ZCA, Kessy et al., 2018), so that it changes little when the statistics do.
 
-    :param n: number of entries; up to ``MAX_WHITENED`` are whitened
+    Statistics are averages over training batches, in buffers whose names begin with ``running_``, as in batch normalisation:
+    targets take over a copy.
+
+    :param n: number of entries; beyond ``MAX_WHITENED``, W is left out
     """
 
     running_batches: th.Tensor
     running_mean: th.Tensor
     running_var: th.Tensor
-    running_covariance: th.Tensor
+    running_correlation: th.Tensor
     running_transform: th.Tensor
 
     def __init__(self, n: int):
         super().__init__()
         self.whitens = 1 < n <= MAX_WHITENED
-        self.features_dim = 2 * n if self.whitens else n
+        self.features_dim = 2 * n if n > 1 else n
         self.register_buffer("running_batches", th.zeros((), dtype=th.int64))
         self.register_buffer("running_mean", th.zeros(n))
         self.register_buffer("running_var", th.ones(n))
         if self.whitens:
-            self.register_buffer("running_covariance", th.eye(n))
+            self.register_buffer("running_correlation", th.eye(n))
             self.register_buffer("running_transform", th.eye(n))
 
     @th.no_grad()
@@ -66,22 +70,22 @@ class RunningNormalization(nn.Module):
         var = x.var(dim=0, unbiased=False)
         # Variance of the mixture of what was seen before and of the batch
         self.running_var.copy_((1 - weight) * self.running_var + weight * var + weight * (1 - weight) * shift.square())
-        if batch == 0:
-            self.running_var.copy_(var)
         self.running_mean += weight * shift
         if not self.whitens:
             return
-        z = self._normalize(x)
-        self.running_covariance.lerp_(z.T @ z / len(z), weight)
+        z = self._standardize(x - self.running_mean)
+        self.running_correlation.lerp_(z.T @ z / len(z), weight)
         if n_updates < UPDATES_PER_WHITENING or n_updates % UPDATES_PER_WHITENING == 0:
             # In double precision, which some accelerators lack
-            eigenvalues, eigenvectors = th.linalg.eigh(self.running_covariance.cpu().double())
+            eigenvalues, eigenvectors = th.linalg.eigh(self.running_correlation.cpu().double())
             scales = (eigenvalues.clamp(min=0) + SHRINKAGE).rsqrt()
             self.running_transform.copy_(eigenvectors * scales @ eigenvectors.T)
 
-    def _normalize(self, x: th.Tensor) -> th.Tensor:
-        floor = MIN_VARIANCE + (RESOLUTION * self.running_mean).square()
-        return ((x - self.running_mean) * (self.running_var + floor).rsqrt()).clamp(-MAX_NORMALIZED, MAX_NORMALIZED)
+    def _variances(self) -> th.Tensor:
+        return self.running_var + MIN_VARIANCE + (RESOLUTION * self.running_mean).square()
+
+    def _standardize(self, deviations: th.Tensor) -> th.Tensor:
+        return (deviations * self._variances().rsqrt()).clamp(-MAX_NORMALIZED, MAX_NORMALIZED)
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """
@@ -90,10 +94,14 @@ class RunningNormalization(nn.Module):
         """
         if self.training:
             self._update(x)
-        z = self._normalize(x)
-        if not self.whitens:
-            return z
-        return th.cat([z, (z @ self.running_transform).clamp(-MAX_WHITENED_VALUE, MAX_WHITENED_VALUE)], dim=1)
+        deviations = x - self.running_mean
+        scaled = (deviations * self._variances().mean().rsqrt()).clamp(-MAX_NORMALIZED, MAX_NORMALIZED)
+        if x.shape[1] == 1:
+            return scaled
+        z = self._standardize(deviations)
+        if self.whitens:
+            z = (z @ self.running_transform).clamp(-MAX_WHITENED_VALUE, MAX_WHITENED_VALUE)
+        return th.cat([scaled, z], dim=1)
 
 
 class NormalizedExtractor(FlattenExtractor):
