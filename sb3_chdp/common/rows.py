@@ -98,5 +98,5 @@ def unpack_bits(columns: Array, n_masks: int) -> Array:
         bits = (columns.long()[:, :, None] >> th.arange(BITS, device=columns.device)) & 1
     else:
         bits = (columns.astype(np.int64)[:, :, None] >> np.arange(BITS)) & 1
-    masks = bits.reshape(len(columns), -1)[:, :n_masks]
+    masks = bits.reshape(len(columns), bits.shape[1] * BITS)[:, :n_masks]
     return masks.bool() if isinstance(masks, th.Tensor) else masks.astype(bool)
