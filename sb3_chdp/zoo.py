@@ -5,9 +5,11 @@ import rl_zoo3.exp_manager
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
+from stable_baselines3.common import callbacks
 from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_chdp
+from sb3_chdp.common.evaluation import evaluate_policy
 from sb3_chdp.registry import ALGORITHMS
 
 
@@ -21,6 +23,8 @@ def register() -> None:
     # rl_zoo3 evaluates replay_buffer_class and the like among its own imports: YAML files may name classes of this package.
     # From there rl_zoo3.train takes its manager, too
     vars(rl_zoo3.exp_manager).update(sb3_chdp=sb3_chdp, ExperimentManager=HybridExperimentManager)
+    # Its evaluations are those of SB3's EvalCallback, which knows no masks
+    vars(callbacks).update(evaluate_policy=evaluate_policy)
 
 
 class HybridExperimentManager(ExperimentManager):

@@ -6,6 +6,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_chdp import HybridActionSpec
+
 UNIT = spaces.Box(-1.0, 1.0, (1,), dtype=np.float32)
 
 
@@ -57,6 +59,72 @@ class LayoutEnv(gym.Env):
 
 def make_layout_env(layout: str = "nested", **kwargs: Any) -> LayoutEnv:
     return LayoutEnv(layouts()[layout], **kwargs)
+
+
+class MaskedEnv(LayoutEnv):
+    """
+    Allows some discrete actions at a time, which it tells by ``action_masks()``; any other one is an error.
+
+    The observation shows the latest mask, so that it can be compared with those that a buffer stores.
+
+    :param layout: name of the action space
+    :param tells_last: whether infos hold the mask too, the only way to learn that of the last state of an episode
+    """
+
+    def __init__(self, layout: str = "nested", tells_last: bool = False):
+        action_space = layouts()[layout]
+        self.codec = HybridActionSpec(action_space)
+        self.masks = np.ones(self.codec.n_discrete_actions, dtype=bool)
+        super().__init__(action_space, spaces.Box(0.0, 1.0, self.masks.shape, dtype=np.float32))
+        self.tells_last = tells_last
+
+    def action_masks(self) -> np.ndarray:
+        return self.masks
+
+    def _draw(self) -> np.ndarray:
+        self.masks = self.np_random.random(len(self.masks)) < 0.3
+        self.masks[self.np_random.integers(len(self.masks))] = True
+        return self.masks.astype(np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
+        super().reset(seed=seed)
+        return self._draw(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        k = int(self.codec.to_row(action)[0])
+        if not self.masks[k]:
+            raise ValueError(f"{action} is masked")
+        _, reward, terminated, truncated, info = super().step(action)
+        obs = self._draw()
+        return obs, reward, terminated, truncated, {**info, **({"action_masks": self.masks} if self.tells_last else {})}
+
+
+class FewValidEnv(gym.Env):
+    """
+    Of 32 discrete actions the observed situation, one of 8, allows 4, of which one earns 1; what is not allowed costs 1.
+
+    Episodes last one step.
+
+    :param with_masks: whether ``action_masks()`` tells what is allowed, else only the penalty does
+    """
+
+    def __init__(self, with_masks: bool):
+        self.action_space = spaces.Tuple((spaces.Discrete(32), UNIT))
+        self.observation_space = spaces.Box(0.0, 1.0, (8,), dtype=np.float32)
+        self.situation = 0
+        if with_masks:
+            self.action_masks = lambda: np.arange(32) // 4 == self.situation
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        super().reset(seed=seed)
+        self.situation = int(self.np_random.integers(8))
+        return np.eye(8, dtype=np.float32)[self.situation], {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
+        situation, choice = divmod(int(action[0]), 4)
+        reward = -1.0 if situation != self.situation else float(choice == situation % 4)
+        obs, _ = self.reset()
+        return obs, reward, True, False, {"is_success": reward == 1}
 
 
 class HybridIdentityEnv(gym.Env):

@@ -5,8 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch as th
-from sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_masked_policy
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from torch.distributions import Categorical, Normal
 
@@ -14,24 +13,7 @@ from sb3_chdp import HPPO
 from sb3_chdp.common.distributions import HybridDistribution
 from sb3_chdp.common.hybrid_box import ConcatenatedBox
 from tests.algorithms import LAYOUTS, make_model
-from tests.hybrid_envs import LayoutEnv, layouts, make_layout_env
-
-
-class MaskedEnv(LayoutEnv):
-    """Allows one discrete action at a time, which it tells by ``action_masks()`` only."""
-
-    def __init__(self):
-        super().__init__(layouts()["nested"])
-        self.allowed = 0
-
-    def action_masks(self):
-        return np.arange(3) == self.allowed
-
-    def step(self, action):
-        if action[0] != self.allowed:
-            raise ValueError(f"{action[0]} is masked, only {self.allowed} is not")
-        self.allowed = int(self.np_random.integers(3))
-        return super().step(action)
+from tests.hybrid_envs import LayoutEnv, MaskedEnv, layouts, make_layout_env
 
 
 def distribution_of(layout, batch_size=6):
@@ -111,52 +93,15 @@ def test_time_limits_bootstrap():
     np.testing.assert_allclose(model.rollout_buffer.returns, 5.0, atol=1e-5)
 
 
-@pytest.mark.parametrize("n_envs", [1, 3])
-def test_action_masks(n_envs, tmp_path):
-    """The environment raises for masked actions."""
-    env = make_vec_env(MaskedEnv, n_envs)
-    model = make_model(HPPO, env)
-    assert model.use_masking
-    eval_callback = EvalCallback(make_vec_env(make_layout_env, 1), n_eval_episodes=1, eval_freq=5, verbose=0)
-    model.learn(60, callback=eval_callback)
-    evaluate_masked_policy(model, env, 3, deterministic=False)
-    model.save(tmp_path / "model")
-    loaded = HPPO.load(tmp_path / "model", env=env)
-    loaded.learn(30)
-    obs = env.reset()
-    masks = np.tile([False, True, False], (n_envs, 1))
-    assert all(action[0] == 1 for action in loaded.predict(obs, deterministic=True, action_masks=masks)[0])
-    assert loaded.predict(obs[0], action_masks=masks[0])[0][0] == 1
-
-
-def test_masks_that_the_environment_has_not():
-    model = make_model(HPPO, make_layout_env(), use_masking=True)
-    with pytest.raises(ValueError, match="action_masks"):
-        model.learn(10)
-    # Those that it has can be ignored
-    assert not make_model(HPPO, MaskedEnv(), use_masking=False).use_masking
-
-
 def test_batch_size_of_one():
     with pytest.raises(ValueError, match="batch_size"):
         make_model(HPPO, make_layout_env(), batch_size=1)
 
 
-def test_masks_of_the_wrong_shape():
-    class TwoMasks(MaskedEnv):
-        def action_masks(self):
-            return np.ones(2, dtype=bool)
-
-    with pytest.raises(ValueError, match=r"action_masks\(\) must give \(n_envs, K\) = \(1, 3\)"):
-        make_model(HPPO, TwoMasks()).learn(10)
-    with pytest.raises(ValueError, match=r"action_masks must have shape \(n, K\) = \(1, 3\)"):
-        make_model(HPPO, MaskedEnv()).predict(np.zeros(2, dtype=np.float32), action_masks=np.ones(2, dtype=bool))
-
-
 def test_masks_are_an_argument_and_no_state():
     """Threads that share a model, each with its own mask, never get an action that theirs forbids."""
     model = make_model(HPPO, MaskedEnv())
-    obs, masks = np.zeros((4, 2), dtype=np.float32), np.eye(3, dtype=bool)
+    obs, masks = np.zeros((4, 3), dtype=np.float32), np.eye(3, dtype=bool)
 
     def forbidden(i):
         k = i % 3
@@ -166,16 +111,16 @@ def test_masks_are_an_argument_and_no_state():
     with ThreadPoolExecutor(8) as pool:
         assert sum(pool.map(forbidden, range(2400))) == 0
     # And the next one is free again
-    assert {int(action[0]) for action in model.predict(np.zeros((100, 2), dtype=np.float32))[0]} == {0, 1, 2}
+    assert {int(action[0]) for action in model.predict(np.zeros((100, 3), dtype=np.float32))[0]} == {0, 1, 2}
 
 
 def test_forward_takes_masks():
     model = make_model(HPPO, MaskedEnv())
-    rows, values, log_probs = model.policy(th.zeros(3, 2), action_masks=np.eye(3, dtype=bool))
+    rows, values, log_probs = model.policy(th.zeros(3, 3), action_masks=np.eye(3, dtype=bool))
     assert rows[:, 0].tolist() == [0, 1, 2] and values.shape == (3, 1)
     # Each had no choice
     np.testing.assert_allclose(log_probs[:, 0].detach(), 0, atol=1e-6)
     # The rows remember the masks
-    _, again, entropy = model.policy.evaluate_actions(th.zeros(3, 2), rows)
+    _, again, entropy = model.policy.evaluate_actions(th.zeros(3, 3), rows)
     th.testing.assert_close(again, log_probs)
     np.testing.assert_allclose(entropy.detach(), 0, atol=1e-6)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from sb3_chdp import HybridActionSpec
 from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox, ScoreBox
-from sb3_chdp.common.rows import RowLayout
+from sb3_chdp.common.rows import RowLayout, pack_bits, unpack_bits
 from sb3_chdp.common.space_tree import children_of, get_part, leaves_of
 from tests.hybrid_envs import box, layouts
 
@@ -220,11 +220,34 @@ def test_rows_are_sampled_and_told_apart(layout, kind):
 
 
 def test_rows_with_masks():
-    space = ConcatenatedBox(layouts()["nested"], with_masks=True)
-    assert space.shape == (1 + 3 + 3,)
-    assert space.low.tolist() == [0, -1, -1, -1, 0, 0, 0] and space.high.tolist() == [2, 1, 1, 1, 1, 1, 1]
-    assert (space.columns.view(space.sample(), "masks") == 1).all()
+    space = ConcatenatedBox(layouts()["nested"], mask_parts=("masks", "next_masks"))
+    assert space.shape == (1 + 3 + 2,) and space.columns.action_width == 4
+    assert space.low.tolist() == [0, -1, -1, -1, 0, 0] and space.high.tolist() == [2, 1, 1, 1, 2**16 - 1, 2**16 - 1]
     assert pickle.loads(pickle.dumps(space)) == space != ConcatenatedBox(layouts()["nested"])
+
+
+@settings(max_examples=50, deadline=None)
+@given(n=st.integers(0, 3), n_masks=st.integers(1, 40), seed=st.integers(0, 1000))
+def test_masks_are_packed_without_loss(n, n_masks, seed):
+    masks = np.random.default_rng(seed).random((n, n_masks)) < 0.5
+    packed = pack_bits(masks)
+    assert packed.dtype == np.float32 and packed.shape == (n, -(-n_masks // 16))
+    assert (unpack_bits(packed, n_masks) == masks).all()
+    assert (pack_bits(th.tensor(masks)).numpy() == packed).all()
+    assert (unpack_bits(th.tensor(packed), n_masks).numpy() == masks).all()
+
+
+@pytest.mark.parametrize("layout", layouts())
+@pytest.mark.parametrize("kind", [HybridBox, ConcatenatedBox, ScoreBox])
+def test_random_rows_are_uniform_over_what_masks_allow(layout, kind):
+    space = kind(layouts()[layout])
+    n = space.spec.n_discrete_actions
+    masks = np.tile(np.arange(n) % 2 == 0, (1000, 1))
+    rows = space.sample_rows(np.random.default_rng(0), 1000, masks)
+    assert all(space.contains(row) for row in rows[:20])
+    counts = np.bincount(space.columns.discrete_actions(rows), minlength=n)
+    allowed = masks[0].sum()
+    assert (counts[1::2] == 0).all() and (np.abs(counts[::2] - 1000 / allowed) < 4 * (1000 / allowed) ** 0.5).all()
 
 
 @pytest.mark.parametrize("tensor", [np.array, th.tensor])

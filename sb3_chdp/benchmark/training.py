@@ -18,7 +18,6 @@ from filelock import FileLock, Timeout
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 import sb3_chdp
@@ -26,6 +25,7 @@ from sb3_chdp.benchmark.checkpoint import save_checkpoint, start
 from sb3_chdp.benchmark.manager import RunManager, settings_of
 from sb3_chdp.benchmark.results import ResultsError, Row, append_row, write_rows, write_text
 from sb3_chdp.benchmark.runs import Run
+from sb3_chdp.common.evaluation import evaluate_policy
 
 EVAL_SEED = 10_000
 

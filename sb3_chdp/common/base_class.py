@@ -5,14 +5,18 @@ import pathlib
 from collections.abc import Iterable
 from typing import Any, TypeVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
+from sb3_contrib.common.maskable.utils import is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecCheckNan, VecEnv, is_vecenv_wrapped
 
 from sb3_chdp.common.checks import check_policy_kwargs
 from sb3_chdp.common.hybrid_box import HybridBox
+from sb3_chdp.common.masks import env_masks
 from sb3_chdp.common.native_env import NativeActionVecEnv
 from sb3_chdp.common.safe_zip import VERSION, misfit, read_model, save_model
 
@@ -31,6 +35,8 @@ class HybridAlgorithm(BaseAlgorithm):
 
     action_layout: str
     hybrid_space: HybridBox
+    # Whether the environment is asked for the discrete actions that it allows
+    use_masking: bool = False
     # An array or a dict of arrays, which SB3's own annotations hand on where one of them is accepted
     _last_obs: Any
     _native_env: NativeActionVecEnv | None = None
@@ -54,6 +60,42 @@ class HybridAlgorithm(BaseAlgorithm):
         if self._native_env is None or self._native_env.venv is not env:
             self._native_env = NativeActionVecEnv(env, self.hybrid_space)
         return self._native_env
+
+    def _resolve_masking(self, use_masking: bool | None) -> bool:
+        """:return: whether to ask the environment for masks, by default if it has them"""
+        if use_masking is None:
+            return self.env is not None and is_masking_supported(self.env)
+        return use_masking
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        if self.use_masking and self.env is not None and not is_masking_supported(self.env):
+            raise ValueError("use_masking is True but the environment has no method action_masks()")
+        return super()._setup_learn(*args, **kwargs)
+
+    def _action_masks(self) -> np.ndarray | None:
+        """:return: (n_envs, K) which discrete actions the environments allow now, None without masking"""
+        assert self.env is not None, "the model has no environment"
+        return env_masks(self.hybrid_space.spec, self.env) if self.use_masking else None
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+        action_masks: np.ndarray | None = None,
+    ) -> tuple[Any, tuple[np.ndarray, ...] | None]:
+        """
+        Get native actions from observations, see :meth:`HybridPolicy.predict`.
+
+        :param observation: the input observation
+        :param state: unused, returned as it is (these policies are not recurrent)
+        :param episode_start: unused
+        :param deterministic: whether to return the same action for the same observation every time
+        :param action_masks: what ``action_masks()`` of the environments returned, False for what may not be taken
+        :return: one native action for one observation, a list of n native actions for n observations; and ``state``
+        """
+        return self.policy.predict(observation, state, episode_start, deterministic, action_masks)  # type: ignore[call-arg]
 
     def _make_hybrid_space(self) -> HybridBox:
         """:return: the space of the rows that buffer and networks work with"""

@@ -11,6 +11,7 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution
 from torch import nn
 
 from sb3_chdp.common.hybrid_box import ConcatenatedBox
+from sb3_chdp.common.rows import pack_bits
 
 SelfHybridDistribution = TypeVar("SelfHybridDistribution", bound="HybridDistribution")
 
@@ -76,7 +77,7 @@ class HybridDistribution(DiagGaussianDistribution):
         """
         k, parameters = self.columns.discrete_actions(actions), self.columns.view(actions, "parameters")
         if "masks" in self.columns:
-            self.apply_masking(self.columns.view(actions, "masks"))
+            self.apply_masking(self.columns.masks(actions))
         index = self._parameter_index.to(k.device)[k]
         log_densities = self.distribution.log_prob(parameters).gather(1, index)
         own = self._parameter_mask.to(k.device)[k]
@@ -98,5 +99,7 @@ class HybridDistribution(DiagGaussianDistribution):
         parts = {"discrete_actions": k, "parameters": parameters}
         if "masks" in self.columns:
             masks = self.categorical.distribution.masks
-            parts["masks"] = th.ones(len(k), self.n_discrete_actions, device=k.device) if masks is None else masks
+            if masks is None:
+                masks = th.ones(len(k), self.n_discrete_actions, dtype=th.bool, device=k.device)
+            parts["masks"] = pack_bits(masks)
         return self.columns.pack(**parts)

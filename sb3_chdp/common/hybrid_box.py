@@ -3,10 +3,14 @@
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 
-from sb3_chdp.common.rows import RowLayout
+from sb3_chdp.common.rows import BITS, RowLayout
 from sb3_chdp.common.spaces import HybridActionSpec
+
+# Score of allowed discrete actions at least; that of others is -1
+LOWEST_ALLOWED = -0.999
 
 
 class HybridBox(spaces.Box):
@@ -16,32 +20,42 @@ class HybridBox(spaces.Box):
     :param native: the user's action space
     :param layout: see :class:`HybridActionSpec`
     :param latent_dim: width of what an algorithm stores behind the parameters
+    :param mask_parts: which masks the rows hold, of ``MASK_PARTS``
     """
 
-    def __init__(self, native: spaces.Space[Any], layout: str = "auto", latent_dim: int = 0):
+    def __init__(self, native: spaces.Space[Any], layout: str = "auto", latent_dim: int = 0, mask_parts: tuple[str, ...] = ()):
         self.native = native
         self.spec = HybridActionSpec(native, layout)
         self.latent_dim = latent_dim
-        self.columns = self._make_columns()
+        self.mask_parts = tuple(mask_parts)
+        n_masks = self.spec.n_discrete_actions
+        self.columns = RowLayout(n_masks, **self._widths(), **dict.fromkeys(self.mask_parts, -(-n_masks // BITS)))
         high = np.ones(self.columns.width, dtype=np.float32)
         low = -high
         if "discrete_actions" in self.columns:
             self.columns.view(low, "discrete_actions")[:] = 0
             self.columns.view(high, "discrete_actions")[:] = self.spec.n_discrete_actions - 1
-        if "masks" in self.columns:
-            self.columns.view(low, "masks")[:] = 0
+        for part in self.mask_parts:
+            self.columns.view(low, part)[:] = 0
+            self.columns.view(high, part)[:] = 2**BITS - 1
         super().__init__(low, high, dtype=np.float32)
 
-    def _make_columns(self) -> RowLayout:
-        return RowLayout(discrete_actions=1, parameters=self.spec.max_parameters, latents=self.latent_dim)
+    def _widths(self) -> dict[str, int]:
+        """:return: columns of a row by name, without masks"""
+        return dict(discrete_actions=1, parameters=self.spec.max_parameters, latents=self.latent_dim)
 
     def to_native(self, rows: np.ndarray) -> list[Any]:
         """:return: n native actions of (n, columns) rows"""
         return self.spec.to_native_batch(rows)
 
-    def sample_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """:return: (n, columns) rows of uniformly random actions; the latents are for the algorithm to fill in"""
-        rows, columns = self.spec.sample_rows(rng, n), self.spec.columns
+    def sample_rows(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
+        """
+        :param rng: random generator
+        :param n: number of rows
+        :param masks: (n, K) False for discrete actions that may not be taken
+        :return: (n, columns) rows of uniformly random actions; the latents are for the algorithm to fill in
+        """
+        rows, columns = self.spec.sample_rows(rng, n, masks), self.spec.columns
         choices, parameters = columns.discrete_actions(rows), columns.view(rows, "parameters")
         return self.columns.pack(discrete_actions=choices, parameters=parameters).astype(np.float32)
 
@@ -71,40 +85,37 @@ class HybridBox(spaces.Box):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The tables of the spec follow from the native space
-        return type(self), (self.native, self.spec.layout, self.latent_dim)
+        return type(self), (self.native, self.spec.layout, self.latent_dim, self.mask_parts)
 
 
 class ConcatenatedBox(HybridBox):
     """
-    The space of rows ``[k | scaled parameters of all actions | masks]``, for algorithms that put out the parameters of
-    all actions at once.
+    The space of rows ``[k | scaled parameters of all actions]``, for algorithms that put out the parameters of all actions
+    at once.
 
     :param native: the user's action space
     :param layout: see :class:`HybridActionSpec`
-    :param with_masks: whether there are K columns for which discrete actions were allowed (1) or not (0)
+    :param mask_parts: see :class:`HybridBox`
     """
 
-    def __init__(self, native: spaces.Space[Any], layout: str = "auto", with_masks: bool = False):
-        self.with_masks = with_masks
-        super().__init__(native, layout)
+    def __init__(self, native: spaces.Space[Any], layout: str = "auto", mask_parts: tuple[str, ...] = ()):
+        super().__init__(native, layout, mask_parts=mask_parts)
 
-    def _make_columns(self) -> RowLayout:
-        masks = {"masks": self.spec.n_discrete_actions} if self.with_masks else {}
-        return RowLayout(discrete_actions=1, parameters=self.spec.n_parameters, **masks)
+    def _widths(self) -> dict[str, int]:
+        return dict(discrete_actions=1, parameters=self.spec.n_parameters)
 
     def to_native(self, rows: np.ndarray) -> list[Any]:
         choices, parameters = self.columns.discrete_actions(rows), self.columns.view(rows, "parameters")
         return self.spec.to_native_batch(self.spec.own_parameters(choices, parameters))
 
-    def sample_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
+    def sample_rows(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
         """:return: (n, columns) rows, k uniform over the actions, all parameters uniform in [-1, 1]"""
-        choices = rng.integers(self.spec.n_discrete_actions, size=n)
+        choices = self.spec.sample_choices(rng, n, masks)
         parameters = rng.uniform(-1.0, 1.0, (n, self.spec.n_parameters))
-        masks = {"masks": np.ones((n, self.spec.n_discrete_actions))} if self.with_masks else {}
-        return self.columns.pack(discrete_actions=choices, parameters=parameters, **masks).astype(np.float32)
+        return self.columns.pack(discrete_actions=choices, parameters=parameters).astype(np.float32)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.native, self.spec.layout, self.with_masks)
+        return type(self), (self.native, self.spec.layout, self.mask_parts)
 
 
 class ScoreBox(ConcatenatedBox):
@@ -112,19 +123,29 @@ class ScoreBox(ConcatenatedBox):
     The space [-1, 1]^(K + P) of rows ``[scores | scaled parameters of all actions]``, for algorithms whose actor gives a
     score to every discrete action, of which the highest decides.
 
-    :param native: the user's action space
-    :param layout: see :class:`HybridActionSpec`
+    The arguments are those of :class:`ConcatenatedBox`.
     """
 
-    def __init__(self, native: spaces.Space[Any], layout: str = "auto"):
-        super().__init__(native, layout)
+    def _widths(self) -> dict[str, int]:
+        return dict(scores=self.spec.n_discrete_actions, parameters=self.spec.n_parameters)
 
-    def _make_columns(self) -> RowLayout:
-        return RowLayout(scores=self.spec.n_discrete_actions, parameters=self.spec.n_parameters)
+    def sample_rows(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
+        """:return: (n, columns) uniform scores and parameters; every discrete action is as likely as the others"""
+        actions = rng.uniform(-1.0, 1.0, (n, self.columns.action_width)).astype(np.float32)
+        if masks is not None:
+            actions = self.mask_scores(th.as_tensor(actions), th.as_tensor(masks)).numpy()
+        rows = np.zeros((n, self.columns.width), dtype=np.float32)
+        rows[:, : self.columns.action_width] = actions
+        return rows
 
-    def sample_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """:return: (n, K + P) uniform scores and parameters; every discrete action is as likely as the others"""
-        return rng.uniform(-1.0, 1.0, (n, self.columns.width)).astype(np.float32)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.native, self.spec.layout)
+    def mask_scores(self, outputs: th.Tensor, masks: th.Tensor) -> th.Tensor:
+        """
+        :param outputs: (B, K + P) scores and parameters, or rows
+        :param masks: (B, K) False for discrete actions that may not be taken
+        :return: the same with the lowest score, -1, for these, and higher ones for all others
+        """
+        scores = self.columns.view(outputs, "scores")
+        # The gradient of a score at the lower end is kept, or it could not get away from there
+        lifted = scores + (scores.clamp(min=LOWEST_ALLOWED) - scores).detach()
+        scores = th.where(masks, lifted, -1.0)
+        return th.cat([scores, outputs[:, scores.shape[1] :]], dim=1)

@@ -2,6 +2,7 @@
 
 import io
 import pathlib
+import warnings
 from typing import Any, TypeVar
 
 import numpy as np
@@ -16,7 +17,10 @@ from stable_baselines3.her import HerReplayBuffer
 
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.buffer_file import load_buffer, save_buffer
+from sb3_chdp.common.masked_n_step import MaskedNStepReplayBuffer
+from sb3_chdp.common.masks import INFO_KEY, read_masks
 from sb3_chdp.common.policies import HybridPolicy
+from sb3_chdp.common.rows import MASK_PARTS, pack_bits
 from sb3_chdp.common.safe_zip import refuse
 from sb3_chdp.common.samples import HybridReplaySamples, name_columns
 
@@ -30,6 +34,8 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
     Parameters not listed here are SB3's (see :class:`OffPolicyAlgorithm`).
 
     :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
+    :param use_masking: whether to ask the environment for ``action_masks()`` and to take no discrete action that they forbid,
+        see :func:`sb3_chdp.common.masks.read_masks`; None: if it has such a method
     :param exploration_fraction: fraction of the training over which the rate of uniformly random actions is reduced
     :param exploration_initial_eps: initial probability of a uniformly random action
     :param exploration_final_eps: final probability of a uniformly random action
@@ -38,6 +44,8 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
     policy: HybridPolicy
     # Standard deviation of Gaussian noise on what the policy puts out; set by algorithms with a deterministic policy
     exploration_noise_schedule: Schedule | None = None
+    # The latest observations and the masks that belong to them
+    _known_masks: tuple[Any, np.ndarray] | None = None
 
     def __init__(
         self,
@@ -60,6 +68,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         exploration_fraction: float = 0.1,
         exploration_initial_eps: float = 1.0,
         exploration_final_eps: float = 0.05,
+        use_masking: bool | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -97,10 +106,17 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         self.exploration_fraction = exploration_fraction
         self.exploration_initial_eps = exploration_initial_eps
         self.exploration_final_eps = exploration_final_eps
+        self.use_masking = self._resolve_masking(use_masking)
 
     def _setup_model(self) -> None:
         self.exploration_schedule = self._exploration_schedule(self.exploration_initial_eps, self.exploration_final_eps)
-        super()._setup_model()
+        with warnings.catch_warnings():
+            if self.use_masking and self.n_steps > 1 and self.replay_buffer_class is None:
+                # In place of SB3's, which it would choose; its warning that n_steps does not count is wrong here
+                warnings.filterwarnings("ignore", message="`n_steps=")
+                self.replay_buffer_class = MaskedNStepReplayBuffer
+                self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": self.n_steps, "gamma": self.gamma}
+            super()._setup_model()
 
     def _exploration_schedule(self, initial: float, final: float) -> Schedule:
         """:return: linear schedule that ends after ``exploration_fraction`` of the training"""
@@ -178,9 +194,24 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         :return: (n_envs, columns) rows, the same for the environment and for the replay buffer
         """
         rng = self.action_space.np_random
+        masks = self._present_masks()
+        rows = self._choose_rows(learning_starts, action_noise, n_envs, rng, masks)
+        if masks is not None:
+            self.hybrid_space.columns.view(rows, "masks")[:] = pack_bits(masks)
+        return rows, rows
+
+    def _choose_rows(
+        self,
+        learning_starts: int,
+        action_noise: ActionNoise | None,
+        n_envs: int,
+        rng: np.random.Generator,
+        masks: np.ndarray | None,
+    ) -> np.ndarray:
+        # Not every policy knows of masks, or needs to
+        of_random = {} if masks is None else {"masks": masks}
         if self.num_timesteps < learning_starts:
-            rows = self.policy.random_rows(rng, n_envs)
-            return rows, rows
+            return self.policy.random_rows(rng, n_envs, **of_random)
         explores = rng.random(n_envs) < self._exploration_rate()
         noise = self._draw_noise(n_envs) if action_noise is None else action_noise()
         if noise is not None and np.size(noise) != n_envs * self.policy.noise_dim:
@@ -190,22 +221,59 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
             )
         obs = self._last_obs
         assert obs is not None, "self._last_obs was not set"
-        rows = self.policy.predict_rows(obs) if noise is None else self.policy.noisy_rows(obs, noise)
+        if noise is None:
+            rows = self.policy.predict_rows(obs, action_masks=masks)
+        else:
+            rows = self.policy.noisy_rows(obs, noise, masks)
         if explores.any():
-            rows[explores] = self._exploratory_rows(rows, rng)[explores]
-        return rows, rows
+            rows[explores] = self._exploratory_rows(rows, rng, **of_random)[explores]
+        return rows
 
     def _exploration_rate(self) -> float:
         """:return: probability that exploration takes the place of the policy"""
         return self.exploration_schedule(self._current_progress_remaining)
 
-    def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator, masks: np.ndarray | None = None) -> np.ndarray:
         """
         :param rows: (n, columns) what the policy would do
         :param rng: random generator
+        :param masks: (n, K) False for discrete actions that may not be taken; not given if there are none
         :return: (n, columns) what exploration does instead: uniformly random actions
         """
-        return self.policy.random_rows(rng, len(rows))
+        return self.policy.random_rows(rng, len(rows), **({} if masks is None else {"masks": masks}))
+
+    def _present_masks(self) -> np.ndarray | None:
+        """:return: (n_envs, K) masks for the latest observations, None without masking"""
+        if self._known_masks is not None and self._known_masks[0] is self._last_obs:
+            return self._known_masks[1]
+        return self._action_masks()
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: Any,
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        SB3's, with the masks of the next states.
+
+        That of the last state of an episode is lost when the environment is reset: it is ``info["action_masks"]`` if the
+        environment leaves it there, else that of the state before.
+        """
+        masks = self._action_masks()
+        if masks is not None:
+            columns = self.hybrid_space.columns
+            next_masks = masks.copy()
+            for i in np.flatnonzero(dones):
+                given = infos[i].get(INFO_KEY)
+                before = columns.masks(buffer_action[i : i + 1])
+                next_masks[i] = (before if given is None else read_masks(self.hybrid_space.spec, given, 1))[0]
+            columns.view(buffer_action, "next_masks")[:] = pack_bits(next_masks)
+            self._known_masks = (new_obs, masks)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _draw_noise(self, n_envs: int) -> np.ndarray | None:
         if self.exploration_noise_schedule is None:
@@ -216,6 +284,13 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
     def _on_step(self) -> None:
         super()._on_step()
         self.logger.record("rollout/exploration_rate", self._exploration_rate())
+
+    def _mask_parts(self) -> tuple[str, ...]:
+        """:return: the masks that rows hold"""
+        return MASK_PARTS if self.use_masking else ()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_known_masks"]
 
     def _sample_batch(self, batch_size: int) -> HybridReplaySamples:
         assert self.replay_buffer is not None

@@ -11,6 +11,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
 
 from sb3_chdp.common.checks import check_finite
 from sb3_chdp.common.hybrid_box import HybridBox
+from sb3_chdp.common.masks import read_masks
 from sb3_chdp.common.safe_zip import load_policy, refuse, save_policy
 
 SelfHybridPolicy = TypeVar("SelfHybridPolicy", bound="HybridPolicy")
@@ -21,7 +22,8 @@ class HybridPolicy(BasePolicy):
     Base class of policies for hybrid action spaces.
 
     Networks work on rows ``[k | scaled parameters | latent]`` (:class:`HybridBox`); ``predict`` returns native actions.
-    Subclasses implement ``_predict``, which returns rows.
+    Subclasses implement ``_predict(observation, deterministic, action_masks)``, which returns rows. Masks are (n, K) boolean
+    tensors; without any the argument is not given.
     """
 
     action_space: HybridBox
@@ -32,6 +34,7 @@ class HybridPolicy(BasePolicy):
         state: tuple[np.ndarray, ...] | None = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
+        action_masks: np.ndarray | None = None,
     ) -> tuple[Any, tuple[np.ndarray, ...] | None]:
         """
         Get native actions from observations.
@@ -40,28 +43,41 @@ class HybridPolicy(BasePolicy):
         :param state: unused, returned as it is (these policies are not recurrent)
         :param episode_start: unused
         :param deterministic: whether to return the same action for the same observation every time
+        :param action_masks: (M,) or (n, M) False for discrete actions that may not be taken, see :func:`read_masks`
         :return: one native action for one observation, a list of n native actions for n observations; and ``state``
-        :raises ValueError: if the observation holds NaN or infinity
+        :raises ValueError: if the observation holds NaN or infinity, or for masks that do not fit or allow nothing
         """
-        return self._predict_native(observation, deterministic), state
+        rows, vectorized_env = self._predict_rows(observation, deterministic, action_masks)
+        actions = self.action_space.to_native(rows)
+        return (actions if vectorized_env else actions[0]), state
 
-    def predict_rows(self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool = False) -> np.ndarray:
+    def predict_rows(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        deterministic: bool = False,
+        action_masks: np.ndarray | None = None,
+    ) -> np.ndarray:
         """
         Like :meth:`predict`, for code that needs arrays.
 
         :return: rows ``[k | scaled parameters | latent]``, (n, columns) for n observations, (columns,) for one
         """
-        rows, vectorized_env = self._predict_rows(observation, deterministic)
+        rows, vectorized_env = self._predict_rows(observation, deterministic, action_masks)
         return rows if vectorized_env else rows[0]
 
-    def _predict_native(self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool, **kwargs: Any) -> Any:
-        """:return: native actions; further arguments are those of the subclass's ``_predict``"""
-        rows, vectorized_env = self._predict_rows(observation, deterministic, **kwargs)
-        actions = self.action_space.to_native(rows)
-        return actions if vectorized_env else actions[0]
+    def mask_arguments(self, action_masks: np.ndarray | None, n: int) -> dict[str, th.Tensor]:
+        """
+        :param action_masks: masks of n observations in the form of :func:`read_masks`
+        :param n: number of observations
+        :return: the argument ``action_masks`` of networks, (n, K); nothing if there are no masks, of which not every policy
+            needs to know
+        """
+        if action_masks is None:
+            return {}
+        return {"action_masks": th.as_tensor(read_masks(self.action_space.spec, action_masks, n), device=self.device)}
 
     def _predict_rows(
-        self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool, **kwargs: Any
+        self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool, action_masks: np.ndarray | None
     ) -> tuple[np.ndarray, bool]:
         self.set_training_mode(False)
         # Common mistake, see https://github.com/DLR-RM/stable-baselines3/issues/1694
@@ -76,8 +92,9 @@ class HybridPolicy(BasePolicy):
             parts = observation if isinstance(observation, dict) else {"observation": np.asarray(observation)}
             for name, part in parts.items():
                 check_finite(name, np.asarray(part) if vectorized_env else np.asarray(part)[None])
+        masks = self.mask_arguments(action_masks, len(next(iter(tensors.values()))))
         with th.no_grad():
-            rows = self._predict(obs_tensor, deterministic=deterministic, **kwargs)
+            rows = self._predict(obs_tensor, deterministic=deterministic, **masks)
         return rows.cpu().numpy(), vectorized_env
 
     def save(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
@@ -117,23 +134,27 @@ class HybridPolicy(BasePolicy):
         """Width of the action noise that :meth:`noisy_rows` takes"""
         return self.action_space.spec.max_parameters
 
-    def noisy_rows(self, observation: np.ndarray | dict[str, np.ndarray], noise: np.ndarray) -> np.ndarray:
+    def noisy_rows(
+        self, observation: np.ndarray | dict[str, np.ndarray], noise: np.ndarray, action_masks: np.ndarray | None = None
+    ) -> np.ndarray:
         """
         :param observation: n observations
         :param noise: (n, noise_dim) action noise
+        :param action_masks: (n, K) False for discrete actions that may not be taken
         :return: rows of sampled actions with the noise added
         """
-        return self.action_space.add_noise(self.predict_rows(observation), noise)
+        return self.action_space.add_noise(self.predict_rows(observation, action_masks=action_masks), noise)
 
-    def random_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
+    def random_rows(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
         """
         Uniformly random actions, for the warm-up and for exploration.
 
         :param rng: random generator
         :param n: number of rows
+        :param masks: (n, K) False for discrete actions that may not be taken
         :return: (n, columns) rows
         """
-        return self.action_space.sample_rows(rng, n)
+        return self.action_space.sample_rows(rng, n, masks)
 
 
 class CnnFeatures(HybridPolicy):

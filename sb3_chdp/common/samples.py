@@ -13,9 +13,10 @@ class HybridReplaySamples(NamedTuple):
     """
     A batch with the columns of its action rows named.
 
-    Shapes: actions (B, columns), the rows; of these discrete_actions (B,) int64, parameters (B, Pmax) in [-1, 1] with
-    padding 0, or (B, P) those of all actions, latents (B, latent_dim), which may be 0 columns; rewards, dones, discounts
-    and weights (B, 1); indices say where a prioritised buffer stores them.
+    Shapes: actions (B, columns), the rows without masks; of these discrete_actions (B,) int64, parameters (B, Pmax) in
+    [-1, 1] with padding 0, or (B, P) those of all actions, latents (B, latent_dim), which may be 0 columns; rewards, dones,
+    discounts and weights (B, 1); indices say where a prioritised buffer stores them; masks and next_masks (B, K) boolean,
+    which discrete actions the environment allowed in the state and in the next one, None without masking.
     """
 
     observations: PyTorchObs
@@ -29,6 +30,8 @@ class HybridReplaySamples(NamedTuple):
     discounts: th.Tensor | float
     weights: th.Tensor | float = 1.0
     indices: Index | None = None
+    masks: th.Tensor | None = None
+    next_masks: th.Tensor | None = None
 
 
 def name_columns(
@@ -42,7 +45,7 @@ def name_columns(
     columns, rows = action_space.columns, replay_data.actions
     return HybridReplaySamples(
         observations=replay_data.observations,
-        actions=rows,
+        actions=rows[:, : columns.action_width],
         discrete_actions=columns.discrete_actions(rows),
         parameters=columns.view(rows, "parameters"),
         latents=columns.view(rows, "latents") if "latents" in columns else rows[:, :0],
@@ -52,4 +55,5 @@ def name_columns(
         discounts=gamma if replay_data.discounts is None else replay_data.discounts,
         weights=getattr(replay_data, "weights", 1.0),
         indices=getattr(replay_data, "indices", None),
+        **{name: columns.masks(rows, name) for name in action_space.mask_parts},
     )

@@ -134,6 +134,23 @@ class HybridActionSpec:
         """(K,) number of parameters of every discrete action"""
         return self.mask.sum(axis=1)
 
+    @property
+    def n_mask_values(self) -> int:
+        """Length of the masks of all discrete parts one after the other: the sum of their numbers of values."""
+        return sum(self._radices) or self.n_discrete_actions
+
+    def join_masks(self, masks: np.ndarray) -> np.ndarray:
+        """
+        :param masks: (n, n_mask_values) booleans, False for values of a discrete part that may not be taken
+        :return: (n, K) booleans, whether all values of a joint discrete action may be taken
+        """
+        if len(self._radices) <= 1:
+            return masks
+        joint = np.ones((len(masks), 1), dtype=bool)
+        for part in np.split(masks, np.cumsum(self._radices)[:-1], axis=1):
+            joint = (joint[:, :, None] & part[:, None]).reshape(len(masks), -1)
+        return joint
+
     def to_native(self, row: np.ndarray) -> Any:
         """
         :param row: (1 + Pmax,) ``[k | scaled parameters]``; parameters are clipped to [-1, 1], padding is ignored
@@ -200,13 +217,26 @@ class HybridActionSpec:
             parameters[box.columns] = np.divide(values, half, out=np.zeros_like(values), where=half > 0)
         return self.columns.pack(discrete_actions=np.array([k]), parameters=parameters[None])[0]
 
-    def sample_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
+    def sample_choices(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
+        """
+        :param rng: random generator
+        :param n: number of choices
+        :param masks: (n, K) False for discrete actions that may not be taken
+        :return: (n,) uniformly random discrete actions
+        """
+        if masks is None:
+            return rng.integers(self.n_discrete_actions, size=n)
+        ranks = rng.integers(masks.sum(axis=1))
+        return (masks.cumsum(axis=1) > ranks[:, None]).argmax(axis=1)
+
+    def sample_rows(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
         """
         :param rng: random generator
         :param n: number of rows
+        :param masks: (n, K) False for discrete actions that may not be taken
         :return: (n, 1 + Pmax) rows, k uniform over the K actions, parameters uniform in [-1, 1], padding 0
         """
-        choices = rng.integers(self.n_discrete_actions, size=n)
+        choices = self.sample_choices(rng, n, masks)
         parameters = rng.uniform(-1.0, 1.0, size=(n, self.max_parameters)) * self.mask[choices]
         return self.columns.pack(discrete_actions=choices, parameters=parameters)
 

@@ -13,6 +13,7 @@ from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_chdp.common.hybrid_box import ScoreBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.policies import HybridPolicy
 from sb3_chdp.common.samples import HybridReplaySamples
@@ -45,8 +46,8 @@ class InvertingGradients(nn.Module):
 
 class HybridTD3Policy(HybridPolicy, TD3Policy):
     """
-    SB3's TD3 policy with an actor whose output stands for hybrid actions. Subclasses say how: by ``_predict``, which
-    returns rows, and ``_noisy_rows``.
+    SB3's TD3 policy with an actor whose output stands for hybrid actions: the rows of a :class:`ScoreBox`. Subclasses can
+    let it stand for others: by ``_predict`` and ``_noisy_rows``, which return rows, and ``mask_outputs``.
 
     Arguments not listed here are those of :class:`stable_baselines3.td3.policies.TD3Policy`; ``optimizer_kwargs`` are
     ``fused=True`` for Adam if None.
@@ -60,6 +61,13 @@ class HybridTD3Policy(HybridPolicy, TD3Policy):
             kwargs["optimizer_kwargs"] = default_optimizer_kwargs(kwargs.get("optimizer_class", th.optim.Adam))
         super().__init__(*args, **kwargs)
 
+    def _build(self, lr_schedule: Schedule) -> None:
+        # Masks are no outputs of actors and no inputs to critics
+        if isinstance(self.action_space, ScoreBox) and self.action_space.mask_parts:
+            bare = type(self.action_space)(self.action_space.native, self.action_space.spec.layout)
+            self.actor_kwargs["action_space"] = self.critic_kwargs["action_space"] = bare
+        super()._build(lr_schedule)
+
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         actor = super().make_actor(features_extractor)
         if self.inverting_gradients:
@@ -70,17 +78,50 @@ class HybridTD3Policy(HybridPolicy, TD3Policy):
     def noise_dim(self) -> int:
         return get_action_dim(self.actor.action_space)
 
-    def noisy_rows(self, observation: np.ndarray | dict[str, np.ndarray], noise: np.ndarray) -> np.ndarray:
+    def noisy_rows(
+        self, observation: np.ndarray | dict[str, np.ndarray], noise: np.ndarray, action_masks: np.ndarray | None = None
+    ) -> np.ndarray:
         self.set_training_mode(False)
         obs_tensor, _ = self.obs_to_tensor(observation)
         with th.no_grad():
             # One environment: the noise has no batch dimension
             noise_tensor = th.as_tensor(noise, dtype=th.float32, device=self.device).view(-1, self.noise_dim)
-            return self._noisy_rows(obs_tensor, noise_tensor).cpu().numpy()
+            masks = self.mask_arguments(action_masks, len(noise_tensor))
+            return self._noisy_rows(obs_tensor, noise_tensor, **masks).cpu().numpy()
 
-    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor) -> th.Tensor:
+    def _predict(
+        self, observation: PyTorchObs, deterministic: bool = False, action_masks: th.Tensor | None = None
+    ) -> th.Tensor:
+        """:return: (n, columns) rows"""
+        return self._complete(self.actor_outputs(self.actor, observation, action_masks))
+
+    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor, action_masks: th.Tensor | None = None) -> th.Tensor:
         """:return: (n, columns) rows for (n, noise_dim) noise on the actor's output"""
-        raise NotImplementedError
+        return self._complete(self.mask_outputs((self.actor(obs) + noise).clamp(-1, 1), action_masks))
+
+    def _complete(self, outputs: th.Tensor) -> th.Tensor:
+        """:return: (n, columns) rows of what the actor puts out; their masks are filled in later"""
+        return nn.functional.pad(outputs, (0, self.action_space.columns.width - outputs.shape[1]))
+
+    def actor_outputs(self, actor: Actor, obs: PyTorchObs, action_masks: th.Tensor | None) -> th.Tensor:
+        """
+        :param actor: the actor or its target
+        :param obs: observations
+        :param action_masks: (B, K) False for discrete actions that may not be taken
+        :return: (B, actor's outputs) that stand for allowed actions
+        """
+        return self.mask_outputs(actor(obs), action_masks)
+
+    def mask_outputs(self, outputs: th.Tensor, action_masks: th.Tensor | None) -> th.Tensor:
+        """
+        :param outputs: (B, actor's outputs)
+        :param action_masks: (B, K) False for discrete actions that may not be taken
+        :return: the same, moved to where they stand for allowed actions; with a gradient
+        """
+        if action_masks is None:
+            return outputs
+        assert isinstance(self.action_space, ScoreBox)
+        return self.action_space.mask_scores(outputs, action_masks)
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), "inverting_gradients": self.inverting_gradients}
@@ -140,6 +181,7 @@ class HybridTD3(HybridOffPolicyAlgorithm):
         exploration_fraction: float = 0.2,
         exploration_initial_eps: float = 1.0,
         exploration_final_eps: float = 0.05,
+        use_masking: bool | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -168,6 +210,7 @@ class HybridTD3(HybridOffPolicyAlgorithm):
             exploration_fraction=exploration_fraction,
             exploration_initial_eps=exploration_initial_eps,
             exploration_final_eps=exploration_final_eps,
+            use_masking=use_masking,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             policy_kwargs=policy_kwargs,
@@ -234,15 +277,16 @@ class HybridTD3(HybridOffPolicyAlgorithm):
         """Set the learning rates of all optimizers according to their schedules."""
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])
 
-    def _smoothed_target_actions(self, next_obs: PyTorchObs) -> th.Tensor:
+    def _smoothed_target_actions(self, next_obs: PyTorchObs, next_masks: th.Tensor | None) -> th.Tensor:
         """:return: (B, actor's outputs) what the target actor puts out, with clipped noise"""
-        next_actions = self.actor_target(next_obs)
+        next_actions = self.policy.actor_outputs(self.actor_target, next_obs, next_masks)
         noise = th.empty_like(next_actions).normal_(0, self.target_policy_noise)
-        return (next_actions + noise.clamp(-self.target_noise_clip, self.target_noise_clip)).clamp(-1, 1)
+        next_actions = (next_actions + noise.clamp(-self.target_noise_clip, self.target_noise_clip)).clamp(-1, 1)
+        return self.policy.mask_outputs(next_actions, next_masks)
 
-    def _next_q_values(self, next_obs: PyTorchObs) -> th.Tensor:
+    def _next_q_values(self, next_obs: PyTorchObs, next_masks: th.Tensor | None) -> th.Tensor:
         """:return: (B, 1) min_i Q_i(s', pi(s') + noise) of the targets"""
-        q_values = self.critic_target(next_obs, self._smoothed_target_actions(next_obs))
+        q_values = self.critic_target(next_obs, self._smoothed_target_actions(next_obs, next_masks))
         return th.cat(q_values, dim=1).min(dim=1, keepdim=True).values
 
     def _current_q_values(self, replay_data: HybridReplaySamples) -> tuple[th.Tensor, ...]:
@@ -252,13 +296,14 @@ class HybridTD3(HybridOffPolicyAlgorithm):
     def _critic_loss(self, replay_data: HybridReplaySamples) -> th.Tensor:
         """:return: mean squared Bellman errors, summed over the critics"""
         with th.no_grad():
-            next_q_values = self._next_q_values(replay_data.next_observations)
+            next_q_values = self._next_q_values(replay_data.next_observations, replay_data.next_masks)
             target_q_values = replay_data.rewards + (1 - replay_data.dones) * replay_data.discounts * next_q_values
         return th.stack([F.mse_loss(q, target_q_values) for q in self._current_q_values(replay_data)]).sum()
 
     def _actor_loss(self, replay_data: HybridReplaySamples) -> th.Tensor:
         """:return: the negative mean of Q1(s, pi(s))"""
-        return -self.critic.q1_forward(replay_data.observations, self.actor(replay_data.observations)).mean()
+        obs = replay_data.observations
+        return -self.critic.q1_forward(obs, self.policy.actor_outputs(self.actor, obs, replay_data.masks)).mean()
 
     def _excluded_save_params(self) -> list[str]:
         parts_of_policy = ["actor", "critic", "actor_target", "critic_target", "update_targets"]

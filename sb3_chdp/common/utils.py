@@ -67,15 +67,18 @@ def default_optimizer_kwargs(optimizer_class: type[th.optim.Optimizer]) -> dict[
 
 
 @th.no_grad()
-def nearest_row(points: th.Tensor, table: th.Tensor) -> th.Tensor:
+def nearest_row(points: th.Tensor, table: th.Tensor, masks: th.Tensor | None = None) -> th.Tensor:
     """
     :param points: (B, d)
     :param table: (K, d)
+    :param masks: (B, K) False for rows of the table that are passed over, None: none
     :return: (B,) index of the row of the table that is nearest in Euclidean distance
     """
     # |p - t|^2 without |p|^2, which is the same for all rows
     n_rows = len(table)
     factors, squares = -2 * points, th.linalg.vecdot(table, table)
+    if masks is not None:
+        return th.addmm(squares, factors, table.t()).masked_fill(~masks, th.inf).min(dim=1).indices
     if n_rows <= NEAREST_ROW_CHUNK:
         return th.addmm(squares, factors, table.t()).min(dim=1).indices
     # The distances to all rows of a large table do not fit into the processor's cache, and the place of a minimum takes

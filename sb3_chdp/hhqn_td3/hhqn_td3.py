@@ -39,4 +39,4 @@ class HHQNTD3(HybridTD3):
     }
 
     def _make_hybrid_space(self) -> HybridBox:
-        return ScoreBox(self.action_space, self.action_layout)
+        return ScoreBox(self.action_space, self.action_layout, self._mask_parts())

@@ -37,16 +37,19 @@ class HierarchicalActor(Actor):
         self.mu = mlp(self.features_dim, spec.n_discrete_actions)
         self.lower = mlp(self.features_dim + spec.n_discrete_actions, spec.n_parameters)
 
-    def forward(self, obs: PyTorchObs, noise: th.Tensor | None = None) -> th.Tensor:
+    def forward(self, obs: PyTorchObs, noise: th.Tensor | None = None, action_masks: th.Tensor | None = None) -> th.Tensor:
         """
         :param obs: observations
         :param noise: (B, K + P) action noise; the lower actor sees the noisy scores, which decide what is executed
+        :param action_masks: (B, K) False for discrete actions that may not be taken; the lower actor sees their scores of -1
         :return: (B, K + P) scores and parameters
         """
         features, columns = self.extract_features(obs, self.features_extractor), self.action_space.columns
         scores = self.mu(features)
         if noise is not None:
             scores = (scores + columns.view(noise, "scores")).clamp(-1, 1)
+        if action_masks is not None:
+            scores = self.action_space.mask_scores(scores, action_masks)
         parameters = self.lower(th.cat([features, scores], dim=1))
         if noise is not None:
             parameters = (parameters + columns.view(noise, "parameters")).clamp(-1, 1)
@@ -62,8 +65,11 @@ class HHQNTD3Policy(HybridTD3Policy):
         actor_kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
         return HierarchicalActor(**actor_kwargs, inverting_gradients=self.inverting_gradients).to(self.device)
 
-    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor) -> th.Tensor:
-        return self.actor(obs, noise)
+    def actor_outputs(self, actor: Actor, obs: PyTorchObs, action_masks: th.Tensor | None) -> th.Tensor:
+        return actor(obs, action_masks=action_masks)
+
+    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor, action_masks: th.Tensor | None = None) -> th.Tensor:
+        return self._complete(self.actor(obs, noise, action_masks))
 
 
 MlpPolicy = HHQNTD3Policy

@@ -5,7 +5,6 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
@@ -67,8 +66,8 @@ class HPPO(HybridAlgorithm, PPO):
         :class:`HybridDictRolloutBuffer`. If ``None``, it will be automatically selected.
     :param rollout_buffer_kwargs: Keyword arguments to pass to the rollout buffer on creation
     :param target_kl: Limit the KL divergence between updates, the mean over both heads
-    :param use_masking: whether to ask the environment for ``action_masks()``, (K,) boolean, over the joint index if there
-        are several discrete parts; None: if it has such a method
+    :param use_masking: whether to ask the environment for ``action_masks()`` and to take no discrete action that they forbid,
+        see :func:`sb3_chdp.common.masks.read_masks`; None: if it has such a method
     :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
     :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
         the reported success rate, mean episode length, and mean reward over
@@ -152,15 +151,13 @@ class HPPO(HybridAlgorithm, PPO):
         self.normalize_advantage = normalize_advantage
         self.target_kl = target_kl
         self.action_layout = action_layout
-        if use_masking is None:
-            use_masking = self.env is not None and is_masking_supported(self.env)
-        self.use_masking = use_masking
+        self.use_masking = self._resolve_masking(use_masking)
 
         if _init_setup_model:
             self._setup_model()
 
     def _make_hybrid_space(self) -> HybridBox:
-        return ConcatenatedBox(self.action_space, self.action_layout, with_masks=self.use_masking)
+        return ConcatenatedBox(self.action_space, self.action_layout, ("masks",) if self.use_masking else ())
 
     def _setup_model(self) -> None:
         if self.rollout_buffer_class is None:
@@ -168,22 +165,10 @@ class HPPO(HybridAlgorithm, PPO):
             self.rollout_buffer_class = HybridDictRolloutBuffer if is_dict else HybridRolloutBuffer
         super()._setup_model()
 
-    def _action_masks(self, env: VecEnv) -> np.ndarray | None:
-        """:return: (n_envs, K) masks for the next actions, None without masking"""
-        if not self.use_masking:
-            return None
-        masks = get_action_masks(env)
-        expected = (env.num_envs, self.hybrid_space.spec.n_discrete_actions)
-        if masks.shape != expected:
-            raise ValueError(f"action_masks() must give (n_envs, K) = {expected} booleans, got shape {masks.shape}")
-        return masks
-
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
         """SB3's ``collect_rollouts``, with masks for the policy and rows that the environment gets as native actions."""
-        if self.use_masking and not is_masking_supported(env):
-            raise ValueError("use_masking is True but the environment has no method action_masks()")
         assert self._last_obs is not None and self._last_episode_starts is not None, "No previous observation was provided"
         check_finite("The observation", self._last_obs)
         native_env = self.native_env(env)
@@ -194,7 +179,7 @@ class HPPO(HybridAlgorithm, PPO):
         for _ in range(n_rollout_steps):
             with th.no_grad():
                 obs_tensor = obs_as_tensor(self._last_obs, self.device)
-                row_tensor, values, log_probs = self.policy(obs_tensor, action_masks=self._action_masks(env))
+                row_tensor, values, log_probs = self.policy(obs_tensor, action_masks=self._action_masks())
             actions = row_tensor.cpu().numpy()
             new_obs, rewards, dones, infos = native_env.step(actions)
             self.num_timesteps += env.num_envs
@@ -225,16 +210,6 @@ class HPPO(HybridAlgorithm, PPO):
             # A resumed run goes on counting, learn() begins at 1
             iteration = (self.num_timesteps - self._num_timesteps_at_start) // (self.n_steps * self.n_envs)
         super().dump_logs(iteration)
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-        action_masks: np.ndarray | None = None,
-    ) -> tuple[Any, tuple[np.ndarray, ...] | None]:
-        return self.policy.predict(observation, state, episode_start, deterministic, action_masks)
 
     def learn(
         self: SelfHPPO,

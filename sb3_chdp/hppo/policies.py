@@ -2,8 +2,8 @@
 
 from typing import Any
 
-import numpy as np
 import torch as th
+from sb3_contrib.common.maskable.distributions import MaybeMasks
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
@@ -32,7 +32,7 @@ class HPPOPolicy(HybridPolicy, ActorCriticPolicy):
         super()._build(lr_schedule)
 
     def forward(
-        self, obs: PyTorchObs, deterministic: bool = False, action_masks: np.ndarray | None = None
+        self, obs: PyTorchObs, deterministic: bool = False, action_masks: MaybeMasks = None
     ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """
         :param obs: observations
@@ -49,7 +49,7 @@ class HPPOPolicy(HybridPolicy, ActorCriticPolicy):
         rows = distribution.get_actions(deterministic=deterministic)
         return rows, values, distribution.log_prob(rows)
 
-    def get_distribution(self, obs: PyTorchObs, action_masks: np.ndarray | None = None) -> HybridDistribution:
+    def get_distribution(self, obs: PyTorchObs, action_masks: MaybeMasks = None) -> HybridDistribution:
         """
         :param obs: observations
         :param action_masks: (n, K) False for discrete actions that may not be taken
@@ -60,26 +60,9 @@ class HPPOPolicy(HybridPolicy, ActorCriticPolicy):
         distribution.apply_masking(action_masks)
         return distribution
 
-    def _predict(
-        self, observation: PyTorchObs, deterministic: bool = False, action_masks: np.ndarray | None = None
-    ) -> th.Tensor:
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False, action_masks: MaybeMasks = None) -> th.Tensor:
         """:return: (n, columns) rows"""
         return self.get_distribution(observation, action_masks).get_actions(deterministic=deterministic)
-
-    def predict(
-        self,
-        observation: np.ndarray | dict[str, np.ndarray],
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-        action_masks: np.ndarray | None = None,
-    ) -> tuple[Any, tuple[np.ndarray, ...] | None]:
-        """
-        Get native actions from observations, see :meth:`HybridPolicy.predict`.
-
-        :param action_masks: (K,) or (n, K) False for discrete actions that may not be taken
-        """
-        return self._predict_native(observation, deterministic, action_masks=action_masks), state
 
 
 MlpPolicy = HPPOPolicy

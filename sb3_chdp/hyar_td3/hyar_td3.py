@@ -112,7 +112,8 @@ class HyARTD3(HybridTD3):
             self._setup_model()
 
     def _make_hybrid_space(self) -> HybridBox:
-        return HybridBox(self.action_space, self.action_layout, self.embedding_dim + self.parameter_latent_dim)
+        latent_dim = self.embedding_dim + self.parameter_latent_dim
+        return HybridBox(self.action_space, self.action_layout, latent_dim, self._mask_parts())
 
     def _network_kwargs(self) -> dict[str, Any]:
         return {**super()._network_kwargs(), "embedding_dim": self.embedding_dim}

@@ -54,29 +54,48 @@ class HyARTD3Policy(HybridTD3Policy):
         with th.no_grad():
             return self.critic_target.extract_features(obs, self.critic_target.features_extractor)
 
-    def decode(self, obs: PyTorchObs, latents: th.Tensor) -> th.Tensor:
+    def decode(self, obs: PyTorchObs, latents: th.Tensor, action_masks: th.Tensor | None = None) -> th.Tensor:
         """
         :param obs: observations
         :param latents: (B, latent_dim) in [-1, 1]
+        :param action_masks: (B, K) False for discrete actions that may not be taken
         :return: (B, columns) rows, with z not scaled: bounds may change before it is used
         """
+        latents = self.mask_outputs(latents, action_masks)
         embeddings, scaled_z = latents[:, : self.embedding_dim], latents[:, self.embedding_dim :]
-        k = self.representation.nearest_action(embeddings)
+        k = self.representation.nearest_action(embeddings, action_masks)
         z = self.representation.unscale(scaled_z)
         parameters, _ = self.representation.decode(self.state_features(obs), k, z)
         stored_latents = th.cat([embeddings, z], dim=1)
         return self.action_space.columns.pack(discrete_actions=k, parameters=parameters, latents=stored_latents)
 
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        """:return: (B, columns) rows"""
-        return self.decode(observation, self.actor(observation))
+    def mask_outputs(self, outputs: th.Tensor, action_masks: th.Tensor | None) -> th.Tensor:
+        """
+        :param outputs: (B, latent_dim) latents
+        :param action_masks: (B, K) False for discrete actions that may not be taken
+        :return: latents with the nearest allowed embedding in place of one that stands for a forbidden action; the gradient
+            is that of the embedding that was put out
+        """
+        if action_masks is None:
+            return outputs
+        with th.no_grad():
+            embeddings = outputs[:, : self.embedding_dim]
+            allowed = self.representation.nearest_action(embeddings, action_masks)
+            is_allowed = self.representation.nearest_action(embeddings) == allowed
+            moves = th.where(is_allowed[:, None], 0.0, self.representation.embed(allowed) - embeddings)
+        return outputs + th.nn.functional.pad(moves, (0, outputs.shape[1] - self.embedding_dim))
 
-    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor) -> th.Tensor:
-        return self.decode(obs, (self.actor(obs) + noise).clamp(-1, 1))
+    def _predict(
+        self, observation: PyTorchObs, deterministic: bool = False, action_masks: th.Tensor | None = None
+    ) -> th.Tensor:
+        return self.decode(observation, self.actor(observation), action_masks)
 
-    def random_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
+    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor, action_masks: th.Tensor | None = None) -> th.Tensor:
+        return self.decode(obs, (self.actor(obs) + noise).clamp(-1, 1), action_masks)
+
+    def random_rows(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
         """Uniformly random actions; their latents are unknown (NaN) until they are looked at by the representation."""
-        rows = super().random_rows(rng, n)
+        rows = super().random_rows(rng, n, masks)
         self.action_space.columns.view(rows, "latents")[:] = np.nan
         return rows
 

@@ -93,9 +93,9 @@ class ActionRepresentation(nn.Module):
         """:return: (B, d1) embeddings e_k = tanh(table row) of (B,) discrete actions"""
         return th.tanh(self.table[k])
 
-    def nearest_action(self, embeddings: th.Tensor) -> th.Tensor:
-        """:return: (B,) discrete actions whose embeddings are nearest to (B, d1) points"""
-        return nearest_row(embeddings, th.tanh(self.table))
+    def nearest_action(self, embeddings: th.Tensor, masks: th.Tensor | None = None) -> th.Tensor:
+        """:return: (B,) discrete actions whose embeddings are nearest to (B, d1) points, of those that (B, K) masks allow"""
+        return nearest_row(embeddings, th.tanh(self.table), masks)
 
     def scale(self, z: th.Tensor) -> th.Tensor:
         """:return: z with the latent bounds mapped to [-1, 1], clipped"""

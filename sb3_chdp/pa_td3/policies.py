@@ -1,8 +1,5 @@
 """Policies of PA-TD3: an MLP with a tanh output of K scores and P parameters."""
 
-import torch as th
-from stable_baselines3.common.type_aliases import PyTorchObs
-
 from sb3_chdp.common.policies import CnnFeatures, CombinedFeatures
 from sb3_chdp.common.td3 import HybridTD3Policy
 
@@ -13,9 +10,6 @@ class PATD3Policy(HybridTD3Policy):
 
     The arguments are those of :class:`HybridTD3Policy`.
     """
-
-    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor) -> th.Tensor:
-        return (self.actor(obs) + noise).clamp(-1, 1)
 
 
 MlpPolicy = PATD3Policy

@@ -16,6 +16,7 @@ from sb3_chdp.pdqn_td3.policies import (
     MultiInputPolicy,
     ParameterizedQNetwork,
     PDQNTD3Policy,
+    mask_values,
 )
 
 
@@ -94,7 +95,7 @@ class PDQNTD3(HybridTD3):
             self._setup_model()
 
     def _make_hybrid_space(self) -> HybridBox:
-        return ConcatenatedBox(self.action_space, self.action_layout)
+        return ConcatenatedBox(self.action_space, self.action_layout, self._mask_parts())
 
     def _network_kwargs(self) -> dict[str, Any]:
         return {**super()._network_kwargs(), "multi_pass": self.multi_pass, "passthrough": self.passthrough}
@@ -109,19 +110,19 @@ class PDQNTD3(HybridTD3):
         update_learning_rate(self.actor.optimizer, actor_learning_rate)
         self.logger.record("train/actor_learning_rate", actor_learning_rate)
 
-    def _next_q_values(self, next_obs: PyTorchObs) -> th.Tensor:
-        """:return: (B, 1) max_k min_i Q_i(s', x(s') + noise)_k of the targets"""
-        next_parameters = self._smoothed_target_actions(next_obs)
+    def _next_q_values(self, next_obs: PyTorchObs, next_masks: th.Tensor | None) -> th.Tensor:
+        """:return: (B, 1) max_k min_i Q_i(s', x(s') + noise)_k of the targets, k over the allowed actions"""
+        next_parameters = self._smoothed_target_actions(next_obs, next_masks)
         q1, q2 = self.critic_target(self.critic_target.features(next_obs), next_parameters)
-        return th.min(q1, q2).max(dim=1, keepdim=True).values
+        return mask_values(th.min(q1, q2), next_masks).max(dim=1, keepdim=True).values
 
     def _current_q_values(self, replay_data: HybridReplaySamples) -> tuple[th.Tensor, ...]:
         features = self.critic.features(replay_data.observations)
         return self.critic.of_actions(features, replay_data.parameters, replay_data.discrete_actions)
 
     def _actor_loss(self, replay_data: HybridReplaySamples) -> th.Tensor:
-        """:return: the negative sum of Q1 over all discrete actions, with the actor's parameters"""
+        """:return: the negative sum of Q1 over all allowed discrete actions, with the actor's parameters"""
         with th.no_grad():
             features = self.critic.features(replay_data.observations)
         q1, _ = self.critic(features, self.actor(replay_data.observations))
-        return -q1.sum(dim=1).mean()
+        return -(q1 if replay_data.masks is None else q1 * replay_data.masks).sum(dim=1).mean()

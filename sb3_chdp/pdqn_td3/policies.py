@@ -152,6 +152,11 @@ class ParameterizedQNetwork(BaseModel):
         return q1, q2
 
 
+def mask_values(q_values: th.Tensor, masks: th.Tensor | None) -> th.Tensor:
+    """:return: (B, K) values, minus infinity for discrete actions that may not be taken"""
+    return q_values if masks is None else q_values.masked_fill(~masks, -th.inf)
+
+
 class PDQNTD3Policy(HybridTD3Policy):
     """
     Policy class (with both actor and critic) for PDQN-TD3: k is the action of highest Q1 with the actor's parameters.
@@ -198,14 +203,20 @@ class PDQNTD3Policy(HybridTD3Policy):
             del critic_kwargs[name]
         return ParameterizedQNetwork(**critic_kwargs, multi_pass=self.multi_pass).to(self.device)
 
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
-        """:return: (B, 1 + P) rows"""
+    def _predict(
+        self, observation: PyTorchObs, deterministic: bool = False, action_masks: th.Tensor | None = None
+    ) -> th.Tensor:
         parameters = self.actor(observation)
         q1, _ = self.critic(self.critic.features(observation), parameters)
-        return self.action_space.columns.pack(discrete_actions=q1.argmax(dim=1), parameters=parameters)
+        k = mask_values(q1, action_masks).argmax(dim=1)
+        return self.action_space.columns.pack(discrete_actions=k, parameters=parameters)
 
-    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor) -> th.Tensor:
-        rows = self._predict(obs)
+    def mask_outputs(self, outputs: th.Tensor, action_masks: th.Tensor | None) -> th.Tensor:
+        """:return: the outputs, parameters that leave the choice to the Q-networks"""
+        return outputs
+
+    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor, action_masks: th.Tensor | None = None) -> th.Tensor:
+        rows = self._predict(obs, action_masks=action_masks)
         # k is the best action for the parameters without noise
         parameters = self.action_space.columns.view(rows, "parameters")
         parameters.add_(noise).clamp_(-1, 1)

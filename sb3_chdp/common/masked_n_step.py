@@ -1,0 +1,35 @@
+"""n-step returns with the masks of the states that they end in."""
+
+import numpy as np
+from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_chdp.common.hybrid_box import HybridBox
+
+
+class MaskedNStepReplayBuffer(NStepReplayBuffer):
+    """
+    SB3's n-step replay buffer for rows with ``next_masks``, which in its samples are those of the last of the n steps.
+
+    The arguments are those of :class:`stable_baselines3.common.buffers.NStepReplayBuffer`.
+    """
+
+    action_space: HybridBox
+
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        # SB3's method draws the environments: here they are drawn before it, to know them, and there once more
+        before = np.random.get_state()
+        env_indices = np.random.randint(0, self.n_envs, size=batch_inds.shape)
+        np.random.set_state(before)
+        samples = super()._get_samples(batch_inds, env)
+
+        steps = (batch_inds[:, None] + np.arange(self.n_steps)) % self.buffer_size
+        ends = self.dones[steps, env_indices[:, None]] + self.timeouts[steps, env_indices[:, None]] > 0
+        # What follows the newest transition is not its future
+        ends |= steps == (self.pos - 1) % self.buffer_size
+        ends[:, -1] = True
+        last = steps[np.arange(len(steps)), ends.argmax(axis=1)]
+        next_masks = self.action_space.columns.view(self.actions[last, env_indices], "next_masks")
+        self.action_space.columns.view(samples.actions, "next_masks")[:] = self.to_torch(next_masks)
+        return samples
