@@ -16,8 +16,8 @@ from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.exploration import vary_parts
 from sb3_chdp.chdp.losses import continuous_policy_loss, critic_loss, discrete_policy_loss, relabel_latents
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_chdp.common.arguments import FRACTION, SWITCH, Accepted, number, of_networks, warn_of_cost, whole
 from sb3_chdp.common.buffers import PrioritizedReplayBuffer
-from sb3_chdp.common.checks import check_at_least, check_fraction
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.samples import HybridReplaySamples
@@ -104,6 +104,19 @@ class CHDP(HybridOffPolicyAlgorithm):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
+    accepted_arguments: ClassVar[dict[str, Accepted]] = {
+        "latent_dim": of_networks(whole(1)),
+        "n_diffusion_steps": of_networks(whole(1)),
+        "eta": number(),
+        "uniform_fraction": FRACTION,
+        "n_action_candidates": whole(1),
+        "n_random_candidates": whole(0),
+        "n_refinement_candidates": whole(0),
+        "n_target_candidates": whole(1),
+        "codebook_lr_factor": number(),
+        "critics_train_codebook": SWITCH,
+        "explore_parts": SWITCH,
+    }
     policy: CHDPPolicy
     actor: CooperativeActor
     actor_target: CooperativeActor
@@ -179,10 +192,6 @@ class CHDP(HybridOffPolicyAlgorithm):
             seed=seed,
             device=device,
         )
-        check_fraction(uniform_fraction=uniform_fraction)
-        check_at_least(1, latent_dim=latent_dim, n_diffusion_steps=n_diffusion_steps, policy_delay=policy_delay)
-        check_at_least(1, n_action_candidates=n_action_candidates, n_target_candidates=n_target_candidates)
-        check_at_least(0, n_random_candidates=n_random_candidates, n_refinement_candidates=n_refinement_candidates)
         self.latent_dim = latent_dim
         self.n_diffusion_steps = n_diffusion_steps
         self.eta = eta
@@ -214,6 +223,7 @@ class CHDP(HybridOffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         super()._setup_model()
+        warn_of_cost(CHDP, n_diffusion_steps=self.n_diffusion_steps, batch_size=self.batch_size)
         self._create_aliases()
         self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
 
@@ -239,7 +249,7 @@ class CHDP(HybridOffPolicyAlgorithm):
 
             # Step 0: critics, eq. 10, and the codebook if they train it
             loss, q_values, errors = critic_loss(policy, replay_data, self.n_target_candidates)
-            gradient_step(loss, critic_optimizers, self.max_grad_norm)
+            gradient_step(loss, critic_optimizers, self.max_grad_norm, "critic_loss")
             policy.actor.codebook.project()
             if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
                 assert replay_data.indices is not None, "a prioritised buffer says where its samples are"
@@ -256,7 +266,7 @@ class CHDP(HybridOffPolicyAlgorithm):
                 parameters = self._parameters_of_latents(replay_data)
                 diffusion_loss, q_loss = discrete_policy_loss(policy, replay_data, features, critic_features, parameters)
                 loss = diffusion_loss + alpha * q_loss
-                gradient_step(loss, [policy.discrete_optimizer], self.max_grad_norm)
+                gradient_step(loss, [policy.discrete_optimizer], self.max_grad_norm, "discrete_loss")
                 losses |= {"discrete_loss": loss, "diffusion_loss_discrete": diffusion_loss}
 
                 # Step 2: continuous policy and codebook, eq. 8, given the updated discrete policy; the features extractor
@@ -265,7 +275,8 @@ class CHDP(HybridOffPolicyAlgorithm):
                 latents, k = self._actions_to_improve(replay_data, features)
                 diffusion_loss, q_loss = continuous_policy_loss(policy, replay_data, features, critic_features, latents, k)
                 loss = diffusion_loss + alpha * q_loss
-                gradient_step(loss, [policy.continuous_optimizer, policy.codebook_optimizer], self.max_grad_norm)
+                optimizers = [policy.continuous_optimizer, policy.codebook_optimizer]
+                gradient_step(loss, optimizers, self.max_grad_norm, "continuous_loss")
                 policy.actor.codebook.project()
                 losses |= {"continuous_loss": loss, "diffusion_loss_continuous": diffusion_loss}
 
