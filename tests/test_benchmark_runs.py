@@ -16,7 +16,6 @@ pytest.importorskip("rl_zoo3")
 pytest.importorskip("submitit")
 
 from sb3_chdp.benchmark import jobs
-from sb3_chdp.benchmark.checkpoint import checkpoint_of
 from sb3_chdp.benchmark.manager import RunManager, settings_of
 from sb3_chdp.benchmark.results import FIELDS, ResultsError, append_row, read_results, read_rows, write_rows
 from sb3_chdp.benchmark.runs import Run
@@ -53,30 +52,53 @@ def wait_for(condition, seconds=600):
     raise TimeoutError
 
 
+def without_seconds(rows):
+    # As text: nan is not equal to itself
+    return [str({key: value for key, value in row.items() if key != "seconds"}) for row in rows]
+
+
 @pytest.mark.parametrize("algo", TINY)
-def test_a_killed_run_goes_on(algo, tmp_path):
-    run = make_run(tmp_path, algo, n_timesteps=2400)
+def test_a_killed_run_goes_on_to_the_last_bit(algo, tmp_path):
+    run = make_run(tmp_path / "killed", algo, n_timesteps=2400)
     process = started(run)
     try:
-        wait_for(lambda: list(run.folder.glob("checkpoint_*")) and len(run.rows()) > 3)
+        wait_for(lambda: list(run.checkpoints.glob("0*_steps")) and len(run.rows()) > 3)
         with pytest.raises(ResultsError, match=f"being trained by process {process.pid}"):
             train(run)
     finally:
         process.kill()
         process.wait()
-    checkpoint = checkpoint_of(run)
-    before = read_rows(checkpoint / "rows.csv")
+    before = run.rows()
     train(run)
     rows = run.rows()
-    assert [str(row) for row in rows[: len(before)]] == [str(row) for row in before]
     assert [row["timesteps"] for row in rows] == [80 * i for i in range(1, 31)]
-    steps = [row["gradient_steps"] for row in rows]
-    assert steps == sorted(steps) and steps[-1] > 0
-    meta = json.loads(run.json.read_text())
-    assert 0 < meta["resumed_at"] == int(checkpoint.name.split("_")[1])
+    assert rows[-1]["gradient_steps"] > 0 and rows[-1]["seconds"] > rows[0]["seconds"] > 0
+    # Rows behind the checkpoint were evaluated again, and came out the same
+    assert without_seconds(rows[: len(before)]) == without_seconds(before)
+    assert 0 < json.loads(run.json.read_text())["resumed_at"] < 2400
+    at_once = make_run(tmp_path / "at_once", algo, n_timesteps=2400, checkpoint_interval=1000)
+    train(at_once)
+    assert without_seconds(at_once.rows()) == without_seconds(rows)
     # Nothing is left of the checkpoints, and a finished run is not trained again
-    assert not list(run.folder.glob("*checkpoint*"))
+    assert not run.checkpoints.exists()
     assert "complete already" in train(run)
+
+
+def test_damaged_checkpoints_of_a_run(tmp_path):
+    run = make_run(tmp_path, n_timesteps=20_000)
+    process = started(run)
+    try:
+        wait_for(lambda: len(list(run.checkpoints.glob("0*_steps"))) == 2)
+    finally:
+        process.kill()
+        process.wait()
+    for generation in run.checkpoints.glob("0*_steps"):
+        (generation / "state.json").write_text("{}")
+    with (
+        pytest.warns(UserWarning, match="is not used"),
+        pytest.raises(ResultsError, match=r"All checkpoints in .*checkpoints are damaged.*Delete .*trained anew"),
+    ):
+        train(run)
 
 
 def test_gradient_steps_of_on_policy_algorithms(tmp_path):

@@ -103,7 +103,7 @@ def test_critic_tells_apart_what_a_parameter_does():
 
 
 def test_parameter_degree_must_be_positive():
-    with pytest.raises(ValueError, match="parameter_degree must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="parameter_degree must be a whole number of at least 1, got 0"):
         make_critic(parameter_degree=0)
 
 

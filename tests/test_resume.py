@@ -340,7 +340,7 @@ def test_folder_that_another_process_writes_to(tmp_path):
 
 
 def test_wrong_use(tmp_path):
-    with pytest.raises(ValueError, match="save_freq must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="save_freq must be a whole number of at least 1, got 0"):
         ResumableCheckpoint(0, tmp_path)
     with pytest.raises(FileNotFoundError, match="no checkpoint"):
         resume(tmp_path / "nothing", make_env(1))

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import (
 
 from sb3_chdp import CHDP, PATD3, FlattenHybridAction, check_hybrid_env
 from tests.algorithms import LAYOUTS, OFF_POLICY_ALGORITHMS, has_learnt, make_model, snapshot
-from tests.hybrid_envs import LayoutEnv, box, layouts, make_layout_env
+from tests.hybrid_envs import LayoutEnv, box, make_layout_env
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -198,32 +198,6 @@ def test_flatten_takes_the_best_score_and_its_parameters():
     assert k == 1 and parameters[1] == pytest.approx(5.0)
     k, parameters = env.action(np.array([0.9, 0.1, 0.2, -1, -0.5, 1.0]))
     assert k == 0 and parameters[0].tolist() == [-1.0, -0.5]
-
-
-class BrokenEnv(LayoutEnv):
-    """Returns what it should not from the given step on."""
-
-    def __init__(self, broken, at=15):
-        super().__init__(layouts()["shared"], episode_length=1000)
-        self.broken, self.at, self.n = broken, at, 0
-
-    def step(self, action):
-        obs, reward, *rest = super().step(action)
-        self.n += 1
-        if self.n == self.at:
-            return (np.full_like(obs, np.nan), reward, *rest) if self.broken == "obs" else (obs, np.nan, *rest)
-        return obs, reward, *rest
-
-
-@pytest.mark.parametrize("broken, message", [("obs", "observation must be finite"), ("reward", "reward must be finite")])
-def test_nan_from_the_env(algorithm, broken, message):
-    model = make_model(algorithm, BrokenEnv(broken))
-    with pytest.raises(ValueError, match=message):
-        model.learn(40)
-    # Nothing is lost: the 14 sound transitions are stored and the networks are finite
-    if algorithm in OFF_POLICY_ALGORITHMS:
-        assert model.replay_buffer.size() == 14
-    assert all(np.isfinite(p.detach().numpy()).all() for p in model.policy.parameters())
 
 
 def test_bad_observations_for_predict(algorithm):

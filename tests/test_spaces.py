@@ -98,10 +98,8 @@ def test_integer_boxes_reach_the_limits_of_their_type(dtype):
     spec = HybridActionSpec(spaces.Tuple((spaces.Discrete(1), spaces.Box(low, high, (1,), dtype))))
     _, (lowest,) = spec.to_native([0, -1.0])
     _, (highest,) = spec.to_native([0, 1.0])
-    if np.dtype(dtype).itemsize < 8:
-        assert (lowest, highest) == (low, high)
-    else:  # the nearest floating-point number inside the bounds
-        assert low <= int(lowest) <= low + 1024 and high - 2048 <= int(highest) <= high
+    assert (int(lowest), int(highest)) == (low, high)
+    assert lowest.dtype == dtype and spec.space.contains(spec.to_native([0, 0.3]))
 
 
 @settings(max_examples=100, deadline=None)

@@ -9,8 +9,11 @@ from typing import Any
 
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chdp.benchmark.runs import STOCK, Run
+from sb3_chdp.common.checkpoint_store import CheckpointStore
+from sb3_chdp.common.resume import resume
 from sb3_chdp.registry import ALGORITHMS
 from sb3_chdp.zoo import HybridExperimentManager, register
 
@@ -21,12 +24,12 @@ N_EVAL_ENVS = 8
 
 class RunManager(HybridExperimentManager):
     """
-    :param run: the run
-    :param trained_agent: model of a checkpoint that :meth:`save_to` left, "" for a new one
+    :param run: the run; its model is that of its last checkpoint if there is one
     """
 
-    def __init__(self, run: Run, trained_agent: str = ""):
+    def __init__(self, run: Run):
         register()
+        self.run = run
         self.flattened = run.algo.startswith(STOCK)
         super().__init__(
             # What enjoy reads from args.yml
@@ -37,16 +40,16 @@ class RunManager(HybridExperimentManager):
             eval_freq=-1,
             n_eval_episodes=run.eval_episodes,
             hyperparams=dict(run.overrides),
-            trained_agent=trained_agent,
-            truncate_last_trajectory=True,
             seed=run.seed,
-            save_replay_buffer=True,
             verbose=0,
             n_eval_envs=min(N_EVAL_ENVS, run.eval_episodes),
             config=self._config(run),
         )
+        # Has setup_experiment() call _load_pretrained_agent()
+        self.continue_training = bool(CheckpointStore(run.checkpoints).generations())
         # The folder of the first start also after the others: sb3-chdp enjoy finds the run by its number, 1
-        self._set_folder(Path(run.folder) / self.algo / f"{self.env_name}_1")
+        folder = Path(run.folder) / self.algo / f"{self.env_name}_1"
+        self.save_path, self.params_path = str(folder), str(folder / self.env_name)
 
     @staticmethod
     def _config(run: Run) -> str | None:
@@ -55,9 +58,6 @@ class RunManager(HybridExperimentManager):
         if run.conf_folder and own.is_file():
             return str(own)
         return None if run.algo.startswith(STOCK) else str(ALGORITHMS[run.algo].hyperparams)
-
-    def _set_folder(self, folder: Path) -> None:
-        self.save_path, self.params_path = str(folder), str(folder / self.env_name)
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         hyperparams, saved = super().read_hyperparameters()
@@ -77,20 +77,8 @@ class RunManager(HybridExperimentManager):
         if "normalize" in defaults:
             settings.setdefault("normalize", defaults["normalize"])
 
-    def save_to(self, folder: Path, model: BaseAlgorithm) -> None:
-        """
-        Save model, replay buffer and statistics of normalisation.
-
-        :param folder: where to, it is made
-        :param model: the model
-        """
-        usual = Path(self.save_path)
-        self._set_folder(folder)
-        try:
-            self.create_log_folder()
-            self.save_trained_model(model)
-        finally:
-            self._set_folder(usual)
+    def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
+        return resume(self.run.checkpoints, env, device=self.device)
 
 
 def settings_of(run: Run) -> dict[str, str]:

@@ -76,6 +76,11 @@ class Run:
         return self.folder / "started.json"
 
     @property
+    def checkpoints(self) -> Path:
+        """:return: folder of its checkpoints while it is not finished"""
+        return self.folder / "checkpoints"
+
+    @property
     def is_complete(self) -> bool:
         """:return: whether it is finished"""
         return self.json.exists()

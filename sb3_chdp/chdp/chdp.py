@@ -17,8 +17,8 @@ from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.exploration import exploration_rate, vary_parts
 from sb3_chdp.chdp.losses import continuous_policy_loss, critic_loss, discrete_policy_loss, relabel_latents, target_values
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_chdp.common.arguments import Accepted, number, of_networks, warn_of_cost, whole
 from sb3_chdp.common.buffers import PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
-from sb3_chdp.common.checks import check_at_least
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.samples import HybridReplaySamples
@@ -95,6 +95,13 @@ class CHDP(HybridOffPolicyAlgorithm):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
+    accepted_arguments: ClassVar[dict[str, Accepted]] = {
+        "latent_dim": of_networks(whole(1)),
+        "n_diffusion_steps": of_networks(whole(1)),
+        "eta": number(),
+        "codebook_lr_factor": number(),
+        "n_action_candidates": whole(1),
+    }
     # Share of uniformly random discrete actions for which the continuous policy is improved
     uniform_fraction: ClassVar[float] = 0.5
     # Whether the critics' loss trains the codebook
@@ -167,8 +174,6 @@ class CHDP(HybridOffPolicyAlgorithm):
             seed=seed,
             device=device,
         )
-        check_at_least(1, latent_dim=latent_dim, n_diffusion_steps=n_diffusion_steps, policy_delay=policy_delay)
-        check_at_least(1, n_action_candidates=n_action_candidates)
         self.latent_dim = latent_dim
         self.n_diffusion_steps = n_diffusion_steps
         self.eta = eta
@@ -189,6 +194,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         if self.replay_buffer_class is None:
             self.replay_buffer_class = self._default_replay_buffer_class()
         super()._setup_model()
+        warn_of_cost(CHDP, n_diffusion_steps=self.n_diffusion_steps, batch_size=self.batch_size)
         self._create_aliases()
         self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
 
@@ -228,7 +234,7 @@ class CHDP(HybridOffPolicyAlgorithm):
                 policy.rescale_values(targets)
             features = policy.critic.features(replay_data.observations)
             loss, q_values, errors = critic_loss(policy, replay_data, features, policy.value_scale.outputs(targets))
-            gradient_step(loss, critic_optimizers, self.max_grad_norm)
+            gradient_step(loss, critic_optimizers, self.max_grad_norm, "critic_loss")
             policy.actor.codebook.project()
             if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
                 assert replay_data.indices is not None, "a prioritised buffer says where its samples are"
@@ -244,7 +250,7 @@ class CHDP(HybridOffPolicyAlgorithm):
                 parameters = self._parameters_of_latents(replay_data)
                 diffusion_loss, q_loss, weights = discrete_policy_loss(policy, replay_data, features, parameters, q_values if self.filters else None)
                 loss = diffusion_loss + alpha * q_loss
-                gradient_step(loss, [policy.discrete_optimizer], self.max_grad_norm)
+                gradient_step(loss, [policy.discrete_optimizer], self.max_grad_norm, "discrete_loss")
                 losses |= {"discrete_loss": loss, "diffusion_loss_discrete": diffusion_loss}
                 if weights is not None:
                     losses["imitated"] = weights.mean()
@@ -253,7 +259,8 @@ class CHDP(HybridOffPolicyAlgorithm):
                 latents, k = self._actions_to_improve(replay_data, features)
                 diffusion_loss, q_loss = continuous_policy_loss(policy, replay_data, features, latents, k, weights)
                 loss = diffusion_loss + alpha * q_loss
-                gradient_step(loss, [policy.continuous_optimizer, policy.codebook_optimizer], self.max_grad_norm)
+                optimizers = [policy.continuous_optimizer, policy.codebook_optimizer]
+                gradient_step(loss, optimizers, self.max_grad_norm, "continuous_loss")
                 policy.actor.codebook.project()
                 losses |= {"continuous_loss": loss, "diffusion_loss_continuous": diffusion_loss}
 

@@ -3,7 +3,7 @@
 import io
 import pathlib
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -14,11 +14,29 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecCheckNan, VecEnv, is_vecenv_wrapped
 
+from sb3_chdp.common.arguments import (
+    FRACTION,
+    POSITIVE,
+    RATE,
+    SEED,
+    Accepted,
+    check,
+    check_arguments,
+    check_load,
+    number,
+    of_networks,
+    one_of,
+    optional,
+    whole,
+)
 from sb3_chdp.common.checks import check_policy_kwargs
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.masks import env_masks
 from sb3_chdp.common.native_env import NativeActionVecEnv
+from sb3_chdp.common.resume import last_checkpoint
 from sb3_chdp.common.safe_zip import VERSION, misfit, read_model, save_model
+from sb3_chdp.common.spaces import LAYOUTS
+from sb3_chdp.common.utils import NonFiniteLossError
 
 SelfHybridAlgorithm = TypeVar("SelfHybridAlgorithm", bound="HybridAlgorithm")
 
@@ -33,6 +51,17 @@ class HybridAlgorithm(BaseAlgorithm):
     deal in rows of numbers, see :class:`HybridBox`. Rollouts step :meth:`native_env`, which converts the one to the other.
     """
 
+    # What arguments may be, by name; subclasses have tables of their own for what they add or narrow
+    accepted_arguments: ClassVar[dict[str, Accepted]] = {
+        "learning_rate": RATE,
+        "n_steps": whole(1),
+        "batch_size": whole(1),
+        "gamma": FRACTION,
+        "max_grad_norm": optional(POSITIVE),
+        "action_layout": of_networks(one_of(LAYOUTS)),
+        "stats_window_size": whole(1),
+        "seed": SEED,
+    }
     action_layout: str
     hybrid_space: HybridBox
     # Whether the environment is asked for the discrete actions that it allows
@@ -106,6 +135,7 @@ class HybridAlgorithm(BaseAlgorithm):
         return {}
 
     def _setup_model(self) -> None:
+        check_arguments(self)
         check_policy_kwargs(self.policy_class, self.policy_kwargs)
         native_space, policy_kwargs = self.action_space, self.policy_kwargs
         self.hybrid_space = self._make_hybrid_space()
@@ -118,6 +148,40 @@ class HybridAlgorithm(BaseAlgorithm):
             self.action_space, self.policy_kwargs = native_space, policy_kwargs
         # set_random_seed() seeded the stand-in
         self.action_space.seed(None if self.seed is None else int(self.seed))
+
+    def learn(self: SelfHybridAlgorithm, *args: Any, **kwargs: Any) -> SelfHybridAlgorithm:
+        """
+        SB3's ``learn``.
+
+        :raises ValueError: for an observation or a reward that is not finite or too large to be learnt from
+        :raises NonFiniteLossError: for a loss like that, before it moves any parameter
+        """
+        try:
+            return super().learn(*args, **kwargs)  # type: ignore[safe-super]  # of the SB3 algorithm that follows
+        except NonFiniteLossError as error:
+            checkpoint = last_checkpoint(self)
+            where = "no ResumableCheckpoint is in use" if checkpoint is None else f"the last checkpoint is {checkpoint}"
+            raise NonFiniteLossError(
+                error.name,
+                error.loss,
+                f" at step {self.num_timesteps}, after {self._n_updates} updates. The model is as it was before, {where}. "
+                "What helps: a smaller learning_rate, smaller rewards or observations",
+            ) from error
+
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        # What a function gives is known only now
+        check(number(), learning_rate=self.lr_schedule(self._current_progress_remaining))
+        super()._update_learning_rate(optimizers)
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        total_timesteps, callback = super()._setup_learn(*args, **kwargs)
+        assert self.env is not None, "You must set the environment before calling learn()"
+        try:
+            self.native_env(self.env).check_observations(self._last_obs)
+        except ValueError:
+            self._last_obs = None  # learning begins with a reset again
+            raise
+        return total_timesteps, callback
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "hybrid_space", "_native_env"]
@@ -165,15 +229,16 @@ class HybridAlgorithm(BaseAlgorithm):
         :param print_system_info: Whether to print system info from the saved model and the current system info
         :param force_reset: Force call to ``reset()`` before training to avoid unexpected behavior.
         :param trusted: whether pickled objects may be read, which runs whatever code the file's author put there
-        :param kwargs: extra arguments to change the model when loading
+        :param kwargs: extra arguments to change the model when loading, but for those that shape the networks
         :return: new model instance with loaded parameters
-        :raises ValueError: if the file is of another class or of a version that does not fit, or if it holds pickled objects
-            and is not trusted
+        :raises ValueError: if the file is of another class or of a version that does not fit, if it holds pickled objects and
+            is not trusted, and for an argument that is unknown, out of range, or does not fit the networks in the file
         """
         file, objects, version = read_model(cls, path, custom_objects, trusted)
+        check_load(cls, path, objects, kwargs)
         try:
             return super().load(file, env, device, objects, print_system_info, force_reset, **kwargs)
         except (AttributeError, LookupError, RuntimeError, TypeError) as error:
-            if version == VERSION:
+            if version == VERSION and not kwargs:
                 raise
-            raise misfit(path, version, error) from error
+            raise misfit(path, version, error, kwargs) from error

@@ -71,3 +71,23 @@ def load_buffer(path: PathOrFile) -> ReplayBuffer | None:
     else:
         vars(buffer).update(content["state"])
     return buffer
+
+
+def check_buffer(path: PathOrFile, buffer: Any, own: Any) -> None:
+    """
+    :param path: file of a replay buffer, for the message
+    :param buffer: what was in it
+    :param own: the replay buffer that it is to replace
+    :raises ValueError: if it holds other data than that one; only their sizes may differ
+    """
+
+    def content(of: Any) -> dict[str, Any]:
+        names = ("observation_space", "action_space", "n_envs", "n_steps", "gamma")
+        return {"class": type(of).__name__, **{name: getattr(of, name) for name in names if hasattr(of, name)}}
+
+    found, expected = content(buffer), content(own)
+    for name, value in expected.items():
+        if found.get(name) != value:
+            raise ValueError(
+                f"{path} must hold a replay buffer like that of the model, with {name} {value}, got {found.get(name)}"
+            )

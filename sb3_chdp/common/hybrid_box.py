@@ -80,6 +80,9 @@ class HybridBox(spaces.Box):
         parameters[:] = np.clip(parameters + noise, -1, 1) * self.spec.mask[self.columns.discrete_actions(rows)]
         return rows
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__} of {self.native}"
+
     def __eq__(self, other: Any) -> bool:
         return type(self) is type(other) and self.__reduce__() == other.__reduce__()
 

@@ -3,10 +3,11 @@
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_chdp.common.checks import check_finite
+from sb3_chdp.common.checks import check_numbers
 from sb3_chdp.common.hybrid_box import HybridBox
 
 
@@ -16,12 +17,14 @@ class NativeActionVecEnv(VecEnvWrapper):
 
     :param venv: the vectorised environment
     :param rows: space of the rows
-    :raises ValueError: from ``step`` if an observation or a reward is not finite, before anything is stored
+    :raises ValueError: from ``step`` if an observation or a reward is unusable, see :func:`check_numbers`, before anything is
+        stored
     """
 
     def __init__(self, venv: VecEnv, rows: HybridBox):
         super().__init__(venv)
         self.rows = rows
+        self._normalize = unwrap_vec_normalize(venv)
 
     def reset(self) -> VecEnvObs:
         return self.venv.reset()
@@ -33,6 +36,30 @@ class NativeActionVecEnv(VecEnvWrapper):
     def step_wait(self) -> VecEnvStepReturn:
         obs, rewards, dones, infos = self.venv.step_wait()
         # One NaN would ruin the networks for good
-        check_finite("The observation", obs)
-        check_finite("The reward", rewards)
+        self.check_observations(obs)
+        check_numbers("The reward", rewards)
+        if self._normalize is not None:
+            check_numbers("The reward before normalization", self._normalize.old_reward)
+        for i in np.flatnonzero(dones).tolist():
+            self._check_terminal(i, infos[i].get("terminal_observation"))
         return obs, rewards, dones, infos
+
+    def check_observations(self, obs: VecEnvObs) -> None:
+        """
+        :param obs: the latest observations of all environments
+        :raises ValueError: if there is one that nothing can be learnt from
+        """
+        check_numbers("The observation", obs)
+        if self._normalize is not None:
+            check_numbers("The observation before normalization", self._normalize.old_obs)
+
+    def _check_terminal(self, index: int, obs: Any) -> None:
+        """Check the last observation of an episode, which goes into the replay buffer or is valued for bootstrapping."""
+        space = self.observation_space
+        parts = {} if obs is None else obs if isinstance(obs, dict) else {"": obs}
+        for key, part in parts.items():
+            name = f"The terminal observation[{key!r}]" if key else "The terminal observation"
+            expected = (space[key] if isinstance(space, spaces.Dict) else space).shape
+            if np.shape(part) != expected:
+                raise ValueError(f"{name} must have shape {expected}, got {np.shape(part)} from environment {index}")
+            check_numbers(name, np.asarray(part)[None], index)

@@ -3,7 +3,7 @@
 import io
 import pathlib
 import warnings
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -15,8 +15,9 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her import HerReplayBuffer
 
+from sb3_chdp.common.arguments import FRACTION, SWITCH, TRAIN_FREQ, Accepted, check_device, whole
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
-from sb3_chdp.common.buffer_file import load_buffer, save_buffer
+from sb3_chdp.common.buffer_file import check_buffer, load_buffer, save_buffer
 from sb3_chdp.common.masked_n_step import MaskedNStepReplayBuffer
 from sb3_chdp.common.masks import INFO_KEY, read_masks
 from sb3_chdp.common.policies import HybridPolicy
@@ -41,6 +42,18 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
     :param exploration_final_eps: final probability of a uniformly random action
     """
 
+    accepted_arguments: ClassVar[dict[str, Accepted]] = {
+        "buffer_size": whole(1),
+        "learning_starts": whole(0),
+        "tau": FRACTION,
+        "train_freq": TRAIN_FREQ,
+        "gradient_steps": whole(-1),
+        "optimize_memory_usage": SWITCH,
+        "policy_delay": whole(1),
+        "exploration_fraction": FRACTION,
+        "exploration_initial_eps": FRACTION,
+        "exploration_final_eps": FRACTION,
+    }
     policy: HybridPolicy
     # Standard deviation of Gaussian noise on what the policy puts out; set by algorithms with a deterministic policy
     exploration_noise_schedule: Schedule | None = None
@@ -76,6 +89,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         seed: int | None = None,
         device: th.device | str = "auto",
     ):
+        check_device(device)
         super().__init__(
             policy,
             env,
@@ -109,14 +123,20 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         self.use_masking = self._resolve_masking(use_masking)
 
     def _setup_model(self) -> None:
+        try:
+            with warnings.catch_warnings():
+                if self.use_masking and self.n_steps > 1 and self.replay_buffer_class is None:
+                    # In place of SB3's, which it would choose; its warning that n_steps does not count is wrong here
+                    warnings.filterwarnings("ignore", message="`n_steps=")
+                    self.replay_buffer_class = MaskedNStepReplayBuffer
+                    self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": self.n_steps, "gamma": self.gamma}
+                super()._setup_model()
+        except MemoryError as error:
+            raise ValueError(
+                f"buffer_size must be such that the replay buffer fits into the memory, got {self.buffer_size}: {error}. "
+                "optimize_memory_usage=True halves what observations need"
+            ) from error
         self.exploration_schedule = self._exploration_schedule(self.exploration_initial_eps, self.exploration_final_eps)
-        with warnings.catch_warnings():
-            if self.use_masking and self.n_steps > 1 and self.replay_buffer_class is None:
-                # In place of SB3's, which it would choose; its warning that n_steps does not count is wrong here
-                warnings.filterwarnings("ignore", message="`n_steps=")
-                self.replay_buffer_class = MaskedNStepReplayBuffer
-                self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": self.n_steps, "gamma": self.gamma}
-            super()._setup_model()
 
     def _exploration_schedule(self, initial: float, final: float) -> Schedule:
         """:return: linear schedule that ends after ``exploration_fraction`` of the training"""
@@ -161,14 +181,22 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         :param path: the file
         :param truncate_last_traj: for ``HerReplayBuffer``: whether the last trajectory in the buffer counts as finished
         :param trusted: whether a pickled file may be read, which runs whatever code the file's author put there
-        :raises ValueError: if the file is of a version that does not fit, or if it is pickled and not trusted
+        :raises ValueError: if the file is of a version that does not fit, if it is pickled and not trusted, or if the buffer
+            is of another class, for other spaces or another number of environments than the model's
         """
         buffer = load_buffer(path)
-        if buffer is None:
-            if not trusted:
-                raise refuse(path, "holds a replay buffer in pickled form")
-            super().load_replay_buffer(path, truncate_last_traj)
-            return
+        if buffer is None and not trusted:
+            raise refuse(path, "holds a replay buffer in pickled form")
+        own = self.replay_buffer
+        try:
+            if buffer is None:
+                super().load_replay_buffer(path, truncate_last_traj)
+                buffer = self.replay_buffer
+            assert buffer is not None
+            check_buffer(path, buffer, own)
+        except BaseException:
+            self.replay_buffer = own
+            raise
         self.replay_buffer = buffer
         if isinstance(buffer, HerReplayBuffer):
             assert self.env is not None, "You must pass an environment at load time when using `HerReplayBuffer`"

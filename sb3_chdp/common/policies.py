@@ -9,7 +9,7 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
 
-from sb3_chdp.common.checks import check_finite
+from sb3_chdp.common.checks import LARGEST, check_numbers
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.masks import read_masks
 from sb3_chdp.common.safe_zip import load_policy, refuse, save_policy
@@ -45,7 +45,8 @@ class HybridPolicy(BasePolicy):
         :param deterministic: whether to return the same action for the same observation every time
         :param action_masks: (M,) or (n, M) False for discrete actions that may not be taken, see :func:`read_masks`
         :return: one native action for one observation, a list of n native actions for n observations; and ``state``
-        :raises ValueError: if the observation holds NaN or infinity, or for masks that do not fit or allow nothing
+        :raises ValueError: if the observation has another shape, or holds NaN, infinity or numbers beyond 1e15; for masks that
+            do not fit or allow nothing
         """
         rows, vectorized_env = self._predict_rows(observation, deterministic, action_masks)
         actions = self.action_space.to_native(rows)
@@ -88,10 +89,10 @@ class HybridPolicy(BasePolicy):
             )
         obs_tensor, vectorized_env = self.obs_to_tensor(observation)
         tensors = obs_tensor if isinstance(obs_tensor, dict) else {"": obs_tensor}
-        if not all(bool(th.isfinite(tensor).all()) for tensor in tensors.values() if tensor.is_floating_point()):
+        if not all(bool((tensor.abs() <= LARGEST).all()) for tensor in tensors.values() if tensor.is_floating_point()):
             parts = observation if isinstance(observation, dict) else {"observation": np.asarray(observation)}
             for name, part in parts.items():
-                check_finite(name, np.asarray(part) if vectorized_env else np.asarray(part)[None])
+                check_numbers(name, np.asarray(part) if vectorized_env else np.asarray(part)[None])
         masks = self.mask_arguments(action_masks, len(next(iter(tensors.values()))))
         with th.no_grad():
             rows = self._predict(obs_tensor, deterministic=deterministic, **masks)

@@ -115,10 +115,12 @@ class ResumableCheckpoint(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         resumed = self._restore()
-        is_due = self.n_calls // self.save_freq > self._saved_at // self.save_freq
-        if not resumed and is_due and self._is_between_logs():
+        if not resumed and self._is_due() and self._is_between_logs():
             self._save()
         self._in_rollout = True
+
+    def _is_due(self) -> bool:
+        return self.n_calls // self.save_freq > self._saved_at // self.save_freq
 
     def _restore(self) -> bool:
         """
@@ -268,6 +270,13 @@ def resume(directory: str | Path, env: GymEnv, device: th.device | str = "auto",
     restore_generators(model, state["later"]["generators"])
     _RUNS[model] = _Run({Path(directory).resolve(): store}, state["later"])
     return model
+
+
+def last_checkpoint(model: BaseAlgorithm) -> Path | None:
+    """:return: folder of the last checkpoint that was written for the model, or that it was resumed from; None without one"""
+    run = _RUNS.get(model)
+    whole = [] if run is None else [folder for store in run.stores.values() for folder in store.whole]
+    return max(whole, key=lambda folder: folder.stat().st_mtime, default=None)
 
 
 def _replay_buffer(model: BaseAlgorithm) -> ReplayBuffer | None:

@@ -188,9 +188,11 @@ def _check_policy_module(cls: Any, data: dict[str, Any], name: Any) -> None:
         raise ValueError(f"{name} is not a {cls.__name__} model: its policy is of {module}")
 
 
-def misfit(path: Any, version: str, error: Exception) -> ValueError:
-    """:return: the error for a file of another version that does not fit this one"""
+def misfit(path: Any, version: str, error: Exception, changes: dict[str, Any]) -> ValueError:
+    """:return: the error for a file of another version, or loaded with other arguments, that does not fit"""
     reason = str(error).strip().partition("\n")[0]
+    if version == VERSION:
+        return ValueError(f"{path} does not fit the arguments given to load(), {', '.join(changes)}: {reason}")
     return ValueError(f"{path} was saved by sb3_chdp {version} and does not fit sb3_chdp {VERSION}: {reason}")
 
 

@@ -178,11 +178,17 @@ def template_action(space: spaces.Space[Any]) -> Any:
 
 def cast_to_box(values: np.ndarray, box: spaces.Box) -> np.ndarray:
     """Reshape float64 values to a box; integers are rounded, and the result is inside the bounds in the box's dtype."""
+    values = values.reshape(box.shape)
+    cast = values
     if box.dtype.kind in "iu":
         # The bounds of 64-bit integers are not floats: clip to the floats inside before the cast, and to the bounds after
         # it. Rounding comes second, else nextafter would cost narrow integers their largest value (255 -> 254)
         limits = np.iinfo(box.dtype.name)
-        values = np.rint(np.clip(values, np.nextafter(float(limits.min), 0), np.nextafter(float(limits.max), 0)))
-    values = values.reshape(box.shape).astype(box.dtype)
+        cast = np.rint(np.clip(values, np.nextafter(float(limits.min), 0), np.nextafter(float(limits.max), 0)))
+    cast = cast.astype(box.dtype)
+    if box.dtype.itemsize == 8 and box.dtype.kind in "iu":
+        # What reaches the float nearest to a bound stands for the bound
+        cast = np.where(values >= box.high.astype(np.float64), box.high, cast)
+        cast = np.where(values <= box.low.astype(np.float64), box.low, cast)
     # Faster than clip; asarray because ufuncs make scalars of 0-dimensional arrays
-    return np.asarray(np.minimum(np.maximum(values, box.low), box.high))
+    return np.asarray(np.minimum(np.maximum(cast, box.low), box.high))

@@ -1,6 +1,6 @@
 """Twin delayed deterministic policy gradients for hybrid actions: what the TD3 baselines share."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -13,11 +13,12 @@ from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_chdp.common.arguments import SWITCH, Accepted, number, of_networks, optional
 from sb3_chdp.common.hybrid_box import ScoreBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.policies import HybridPolicy
 from sb3_chdp.common.samples import HybridReplaySamples
-from sb3_chdp.common.utils import TargetUpdate, default_optimizer_kwargs
+from sb3_chdp.common.utils import TargetUpdate, default_optimizer_kwargs, gradient_step
 
 
 class _InvertGradient(th.autograd.Function):
@@ -147,6 +148,13 @@ class HybridTD3(HybridOffPolicyAlgorithm):
     :param inverting_gradients: whether the gradients at the actor's output are inverted
     """
 
+    accepted_arguments: ClassVar[dict[str, Accepted]] = {
+        "target_policy_noise": number(),
+        "target_noise_clip": number(),
+        "exploration_noise": number(),
+        "exploration_initial_noise": optional(number()),
+        "inverting_gradients": of_networks(SWITCH),
+    }
     policy: HybridTD3Policy
     actor: Actor
     actor_target: Actor
@@ -232,9 +240,9 @@ class HybridTD3(HybridOffPolicyAlgorithm):
         return {"inverting_gradients": self.inverting_gradients}
 
     def _setup_model(self) -> None:
+        super()._setup_model()
         initial = self.exploration_noise if self.exploration_initial_noise is None else self.exploration_initial_noise
         self.exploration_noise_schedule = self._exploration_schedule(initial, self.exploration_noise)
-        super()._setup_model()
         self._create_aliases()
         self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
 
@@ -254,18 +262,13 @@ class HybridTD3(HybridOffPolicyAlgorithm):
 
             critic_loss = self._critic_loss(replay_data)
             critic_losses.append(critic_loss.detach())
-            self.critic.optimizer.zero_grad()
-            critic_loss.backward()
-            self.critic.optimizer.step()
+            gradient_step(critic_loss, [self.critic.optimizer], name="critic_loss")
 
             # Delayed policy updates
             if self._n_updates % self.policy_delay == 0:
                 actor_loss = self._actor_loss(replay_data)
                 actor_losses.append(actor_loss.detach())
-                self.actor.optimizer.zero_grad()
-                actor_loss.backward()
-                self.actor.optimizer.step()
-
+                gradient_step(actor_loss, [self.actor.optimizer], name="actor_loss")
                 self.update_targets(self.tau)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

@@ -43,21 +43,45 @@ class TargetUpdate:
             th._foreach_copy_(self.batch_norm_stats_target, self.batch_norm_stats)
 
 
-def gradient_step(loss: th.Tensor, optimizers: list[th.optim.Optimizer], max_grad_norm: float | None) -> None:
+class NonFiniteLossError(FloatingPointError):
+    """
+    A loss or its gradient is NaN, infinite, or too large to be squared. No parameter has moved because of it.
+
+    :param name: name of the loss in the log
+    :param loss: its value, None if that is not known
+    :param details: where it happened, for the message
+    """
+
+    def __init__(self, name: str, loss: float | None = None, details: str = ""):
+        self.name, self.loss = name, loss
+        got = "" if loss is None else f", got {loss:.6g}"
+        super().__init__(f"{name} and the squares of its gradient must be finite{got}{details}")
+
+
+def gradient_step(
+    loss: th.Tensor, optimizers: list[th.optim.Optimizer], max_grad_norm: float | None = None, name: str = "The loss"
+) -> None:
     """
     One gradient step of the parameters of the given optimizers, and of no others.
 
     :param loss: the loss to minimise
     :param optimizers: their parameters are all that moves
     :param max_grad_norm: bound on the gradient norm of each optimizer's parameters, None for none
+    :param name: name of the loss in the log, for the message
+    :raises NonFiniteLossError: before anything moves, if the loss or a gradient norm is not finite
     """
     groups = [[p for group in optimizer.param_groups for p in group["params"]] for optimizer in optimizers]
     params = [p for group in groups for p in group]
-    for p, gradient in zip(params, th.autograd.grad(loss, params), strict=True):
+    # Without a gradient: those of a shared features extractor, which belongs to another optimizer's loss
+    for p, gradient in zip(params, th.autograd.grad(loss, params, allow_unused=True), strict=True):
         p.grad = gradient
-    for optimizer, group in zip(optimizers, groups, strict=True):
+    norms = [th.nn.utils.get_total_norm([p.grad for p in group if p.grad is not None]) for group in groups]
+    # One look for all of it. Infinite norms are also those of gradients whose squares, which Adam keeps, are infinite
+    if not math.isfinite(sum(norms, loss.detach()).item()):
+        raise NonFiniteLossError(name, loss.item())
+    for optimizer, group, norm in zip(optimizers, groups, norms, strict=True):
         if max_grad_norm is not None:
-            th.nn.utils.clip_grad_norm_(group, max_grad_norm)
+            th.nn.utils.clip_grads_with_norm_(group, max_grad_norm, norm)
         optimizer.step()
 
 

@@ -14,10 +14,21 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_chdp.common.arguments import (
+    FRACTION,
+    POSITIVE,
+    SWITCH,
+    Accepted,
+    check_device,
+    number,
+    optional,
+    scheduled,
+    whole,
+)
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
-from sb3_chdp.common.checks import check_finite
 from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox
 from sb3_chdp.common.rollout_buffers import HybridDictRolloutBuffer, HybridRolloutBuffer
+from sb3_chdp.common.utils import NonFiniteLossError
 from sb3_chdp.hppo.policies import CnnPolicy, HPPOPolicy, MlpPolicy, MultiInputPolicy
 
 SelfHPPO = TypeVar("SelfHPPO", bound="HPPO")
@@ -86,6 +97,20 @@ class HPPO(HybridAlgorithm, PPO):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
+    accepted_arguments: ClassVar[dict[str, Accepted]] = {
+        # Advantages are normalised over a minibatch
+        "batch_size": whole(2),
+        "n_epochs": whole(1),
+        "gae_lambda": FRACTION,
+        "clip_range": scheduled(POSITIVE),
+        "clip_range_vf": optional(scheduled(POSITIVE)),
+        "normalize_advantage": SWITCH,
+        "ent_coef": number(),
+        "vf_coef": number(),
+        "max_grad_norm": POSITIVE,
+        "target_kl": optional(POSITIVE),
+        "use_masking": optional(SWITCH),
+    }
     policy: HPPOPolicy
 
     def __init__(
@@ -117,6 +142,7 @@ class HPPO(HybridAlgorithm, PPO):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
+        check_device(device)
         # Not PPO's constructor, which accepts no hybrid action spaces and hands on no other list of spaces
         OnPolicyAlgorithm.__init__(
             self,
@@ -142,8 +168,6 @@ class HPPO(HybridAlgorithm, PPO):
             _init_setup_model=False,
             supported_action_spaces=HYBRID_SPACES,
         )
-        if batch_size < 2:
-            raise ValueError(f"batch_size must be at least 2 for the normalization of advantages, got {batch_size}")
         self.batch_size = batch_size
         self.n_epochs = n_epochs
         self.clip_range = clip_range
@@ -170,7 +194,6 @@ class HPPO(HybridAlgorithm, PPO):
     ) -> bool:
         """SB3's ``collect_rollouts``, with masks for the policy and rows that the environment gets as native actions."""
         assert self._last_obs is not None and self._last_episode_starts is not None, "No previous observation was provided"
-        check_finite("The observation", self._last_obs)
         native_env = self.native_env(env)
         self.policy.set_training_mode(False)
         rollout_buffer.reset()
@@ -204,6 +227,28 @@ class HPPO(HybridAlgorithm, PPO):
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
+
+    def train(self) -> None:
+        """
+        SB3's ``train``, which stops before a loss that is not finite moves the policy.
+
+        :raises NonFiniteLossError: for such a loss
+        """
+        returns = self.rollout_buffer.returns
+        if not np.isfinite(np.vdot(returns, returns)):
+            raise NonFiniteLossError("value_loss")
+
+        def check_gradient(optimizer: th.optim.Optimizer, *_: Any) -> None:
+            gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+            if not th.nn.utils.get_total_norm(gradients).isfinite():
+                raise NonFiniteLossError("loss")
+
+        # For the time of the call: copies of a model have no hooks
+        hook = self.policy.optimizer.register_step_pre_hook(check_gradient)
+        try:
+            super().train()
+        finally:
+            hook.remove()
 
     def dump_logs(self, iteration: int = 0) -> None:
         if iteration > 0:

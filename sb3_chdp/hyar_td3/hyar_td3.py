@@ -8,10 +8,11 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 
-from sb3_chdp.common.checks import check_at_least
+from sb3_chdp.common.arguments import RATE, Accepted, of_networks, whole
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.samples import HybridReplaySamples
 from sb3_chdp.common.td3 import HybridTD3
+from sb3_chdp.common.utils import gradient_step
 from sb3_chdp.hyar_td3.policies import CnnPolicy, HyARTD3Policy, MlpPolicy, MultiInputPolicy
 from sb3_chdp.hyar_td3.representation import ActionBatch
 
@@ -66,6 +67,15 @@ class HyARTD3(HybridTD3):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
+    accepted_arguments: ClassVar[dict[str, Accepted]] = {
+        "embedding_dim": of_networks(whole(1)),
+        "parameter_latent_dim": of_networks(whole(1)),
+        "representation_learning_rate": RATE,
+        "representation_batch_size": whole(1),
+        "representation_warmup_steps": whole(1),
+        "representation_freq": whole(1),
+        "representation_steps": whole(1),
+    }
     policy: HyARTD3Policy
 
     def __init__(
@@ -97,7 +107,6 @@ class HyARTD3(HybridTD3):
             _init_setup_model=False,
             **kwargs,
         )
-        check_at_least(1, embedding_dim=embedding_dim, parameter_latent_dim=parameter_latent_dim)
         self.embedding_dim = embedding_dim
         self.parameter_latent_dim = parameter_latent_dim
         self.representation_learning_rate = representation_learning_rate
@@ -157,9 +166,7 @@ class HyARTD3(HybridTD3):
         losses = []
         for _ in range(gradient_steps):
             loss = representation.loss(self._sample_actions(self.representation_batch_size))
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
+            gradient_step(loss, [optimizer], name="representation_loss")
             losses.append(loss.item())
         representation.update_bounds(self._sample_actions(BOUNDS_SAMPLE))
         self.logger.record("train/representation_loss", np.mean(losses[-100:]))

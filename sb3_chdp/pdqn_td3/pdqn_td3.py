@@ -7,6 +7,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 
+from sb3_chdp.common.arguments import RATE, SWITCH, Accepted, of_networks
 from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox
 from sb3_chdp.common.samples import HybridReplaySamples
 from sb3_chdp.common.td3 import HybridTD3
@@ -60,6 +61,7 @@ class PDQNTD3(HybridTD3):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
+    accepted_arguments: ClassVar[dict[str, Accepted]] = {"actor_learning_rate": RATE, "multi_pass": of_networks(SWITCH)}
     policy: PDQNTD3Policy
     critic: ParameterizedQNetwork
     critic_target: ParameterizedQNetwork

@@ -1,0 +1,194 @@
+"""Numbers that nothing can be learnt from are refused before they are stored or fed, and losses before they move a network."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_chdp.common.checks import check_numbers
+from sb3_chdp.common.resume import ResumableCheckpoint, resume
+from sb3_chdp.common.utils import NonFiniteLossError, gradient_step
+from tests.algorithms import OFF_POLICY_ALGORITHMS, has_learnt, make_model, snapshot
+from tests.hybrid_envs import LayoutEnv, box, layouts, make_layout_env
+
+DICT = spaces.Dict({"place": box(-1, 1, 2), "speed": box(-1, 1, 1)})
+
+
+class BrokenEnv(LayoutEnv):
+    """
+    Puts out a number that it should not.
+
+    :param place: "first" (observation after the second reset), "next" (the 15th), "terminal" or "truncated" (the last of the
+        second episode) or "reward"
+    :param value: the number
+    """
+
+    def __init__(self, place, value, observation_space=None):
+        super().__init__(layouts()["shared"], observation_space, episode_length=10)
+        self.place, self.value, self.n = place, value, 0
+        self.n_resets = 0
+
+    def broken(self, obs):
+        part = obs["speed"] if isinstance(obs, dict) else obs
+        part[0] = self.value
+        return obs
+
+    def reset(self, **kwargs):
+        obs, info = super().reset(**kwargs)
+        self.n_resets += 1
+        return (self.broken(obs) if self.place == "first" and self.n_resets == 2 else obs), info
+
+    def step(self, action):
+        obs, reward, terminated, truncated, info = super().step(action)
+        self.n += 1
+        if self.place == "terminal":
+            terminated, truncated = truncated, False
+        if (self.place, self.n) in (("next", 15), ("terminal", 20), ("truncated", 20)):
+            obs = self.broken(obs)
+        if (self.place, self.n) == ("reward", 15):
+            reward = self.value
+        return obs, reward, terminated, truncated, info
+
+
+def arrays_of(model):
+    """:return: everything that must be finite: parameters, what optimizers keep, and the buffer"""
+    yield from (p.detach().numpy() for p in model.policy.parameters())
+    for name, state in model.get_parameters().items():
+        if name.endswith("optimizer"):
+            yield from (np.asarray(value) for each in state["state"].values() for value in each.values())
+    buffer = model.replay_buffer if hasattr(model, "replay_buffer") else model.rollout_buffer
+    for part in (buffer.observations, getattr(buffer, "next_observations", {}), buffer.rewards):
+        yield from part.values() if isinstance(part, dict) else [part]
+
+
+def is_finite(model):
+    return all(np.isfinite(array).all() for array in arrays_of(model))
+
+
+def goes_on(model, env):
+    """:return: whether the model learns in a sound environment, and stays finite"""
+    model.set_env(env)
+    before = snapshot(model)
+    model.learn(40)
+    return has_learnt(model, before) and is_finite(model)
+
+
+PLACES = {
+    "first": "The observation",
+    "next": "The observation",
+    "terminal": "The terminal observation",
+    "truncated": "The terminal observation",
+    "reward": "The reward",
+}
+
+
+@pytest.mark.parametrize("value", [np.nan, -np.inf, 1e38], ids=str)
+@pytest.mark.parametrize("place", PLACES)
+def test_bad_numbers_are_refused(algorithm, place, value):
+    env = DummyVecEnv([make_shared_env, lambda: BrokenEnv(place, value)])
+    model = make_model(algorithm, env)
+    with pytest.raises(ValueError, match=rf"{PLACES[place]} must be finite and between .* from environment\(s\) \[1\]"):
+        model.learn(60)
+    if algorithm in OFF_POLICY_ALGORITHMS:
+        # The sound transitions before are stored
+        assert model.replay_buffer.size() == {"first": 9, "next": 14, "terminal": 19, "truncated": 19, "reward": 14}[place]
+    assert is_finite(model)
+    assert goes_on(model, DummyVecEnv([make_shared_env] * 2))
+
+
+def make_shared_env(**kwargs):
+    return make_layout_env("shared", **kwargs)
+
+
+@pytest.mark.parametrize("place", ["first", "next", "truncated"])
+def test_bad_numbers_in_dict_observations(algorithm, place):
+    model = make_model(algorithm, BrokenEnv(place, np.nan, DICT), "MultiInputPolicy")
+    with pytest.raises(ValueError, match=rf"{PLACES[place]}\['speed'\] must be finite .* from environment\(s\) \[0\]"):
+        model.learn(60)
+    assert is_finite(model) and goes_on(model, make_shared_env(observation_space=DICT))
+
+
+def test_the_very_first_observation(algorithm):
+    env = BrokenEnv("first", np.nan)
+    env.n_resets = 1
+    model = make_model(algorithm, env)
+    with pytest.raises(ValueError, match="The observation must be finite"):
+        model.learn(60)
+    # The same environment, which is sound from its next reset on
+    model.learn(40, reset_num_timesteps=False)
+    assert is_finite(model)
+
+
+@pytest.mark.parametrize("reward", [3e38, 1e20], ids=str)
+def test_rewards_that_normalization_hides(algorithm, reward):
+    env = VecNormalize(DummyVecEnv([lambda: BrokenEnv("reward", reward)]))
+    model = make_model(algorithm, env)
+    with pytest.raises(ValueError, match="The reward before normalization must be finite"):
+        model.learn(60)
+    assert is_finite(model) and goes_on(model, VecNormalize(DummyVecEnv([make_shared_env])))
+
+
+def test_observations_that_normalization_hides(off_policy_algorithm):
+    env = VecNormalize(DummyVecEnv([lambda: BrokenEnv("next", 1e30)]))
+    with pytest.raises(ValueError, match="The observation before normalization must be finite"):
+        make_model(off_policy_algorithm, env).learn(60)
+
+
+class ShortLastObservation(LayoutEnv):
+    """Of shape (1,) instead of (2,), which NumPy would stretch."""
+
+    def step(self, action):
+        obs, *rest = super().step(action)
+        return obs[:1], *rest
+
+
+def test_observations_of_another_shape(algorithm):
+    model = make_model(algorithm, ShortLastObservation(layouts()["shared"]))
+    with pytest.raises(ValueError, match=r"terminal observation must have shape \(2,\), got \(1,\) from environment 0"):
+        model.learn(60)
+    with pytest.raises(ValueError, match=r"shape \(1,\)"):
+        model.predict(np.zeros(1, dtype=np.float32))
+
+
+@pytest.mark.parametrize(
+    "value, is_good",
+    [([1e15, -1e15], True), ([1.1e15, 0], False), (np.array([2**62]), False), (np.array([2**31 - 1], dtype=np.int32), True),
+     (np.full((3, 200, 200), 9e14), True), (np.array([np.nan], dtype=np.float16), False), (np.ones((2, 0)), True)],
+)  # fmt: skip
+def test_numbers_are_told_apart(value, is_good):
+    value = np.asarray(value)
+    if is_good:
+        check_numbers("It", value)
+    else:
+        with pytest.raises(ValueError, match=r"It must be finite .* environment\(s\) \[4\]"):
+            check_numbers("It", value, first_env=4)
+
+
+@pytest.mark.parametrize("factor, message", [(np.nan, "got nan"), (np.inf, "got inf"), (1e25, "got 1e\\+25")])
+def test_a_loss_is_refused_before_it_moves_anything(factor, message):
+    parameter = th.nn.Parameter(th.ones(3))
+    optimizer = th.optim.Adam([parameter])
+    with pytest.raises(NonFiniteLossError, match=f"my_loss .*{message}"):
+        gradient_step(parameter.mean() * factor, [optimizer], 1.0, "my_loss")
+    assert (parameter == 1).all() and not optimizer.state
+    gradient_step(parameter.mean(), [optimizer], 1.0, "my_loss")
+    assert (parameter != 1).all()
+
+
+@pytest.mark.parametrize("with_checkpoint", [True, False])
+def test_a_diverged_training_stops(algorithm, with_checkpoint, tmp_path):
+    callback = ResumableCheckpoint(10, tmp_path) if with_checkpoint else None
+    model = make_model(algorithm, make_shared_env()).learn(40, callback)
+    with th.no_grad():
+        for name, parameter in model.policy.named_parameters():
+            if "value_net" in name or "critic" in name:
+                parameter.fill_(1e37)
+    weights = snapshot(model)
+    checkpoint = "the last checkpoint is .*_40_steps" if with_checkpoint else "no ResumableCheckpoint is in use"
+    message = rf"_loss and the squares .* at step \d+, after \d+ updates\. The model is as it was before, {checkpoint}"
+    with pytest.raises(NonFiniteLossError, match=message):
+        model.learn(40, reset_num_timesteps=False)
+    assert not has_learnt(model, weights)
+    if with_checkpoint:
+        assert goes_on(resume(tmp_path, make_shared_env()), make_shared_env())
