@@ -68,9 +68,9 @@ class OneHotCodebook(Codebook):
         super().__init__(n_discrete_actions, n_discrete_actions)
         self.project()
 
-    def quantize(self, latents: th.Tensor) -> th.Tensor:
-        """:return: (B,) index of the largest entry"""
-        return latents.argmax(dim=1)
+    def quantize(self, latents: th.Tensor, masks: th.Tensor | None = None) -> th.Tensor:
+        """:return: (B,) index of the largest entry, of those that (B, K) masks allow"""
+        return (latents if masks is None else latents.masked_fill(~masks, -th.inf)).argmax(dim=1)
 
     def representative_latents(self, k: th.Tensor) -> th.Tensor:
         """:return: (B, K) vectors of 1 at k and -1 elsewhere"""
@@ -109,7 +109,7 @@ class WithoutCodebook(CHDP):
 
     def _make_hybrid_space(self) -> HybridBox:
         n_discrete_actions = HybridBox(self.action_space, self.action_layout).spec.n_discrete_actions
-        return HybridBox(self.action_space, self.action_layout, n_discrete_actions)
+        return HybridBox(self.action_space, self.action_layout, n_discrete_actions, self._mask_parts())
 
 
 class WithoutSequentialUpdate(CHDP):

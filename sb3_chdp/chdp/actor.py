@@ -54,14 +54,22 @@ class CooperativeActor(nn.Module):
         """:return: (B, Pmax) 1 for the parameters that action k has, None if no action has padding"""
         return self.parameter_mask[k] if self._has_padding else None
 
-    def sample_latents(self, features: th.Tensor, noise: th.Tensor | None = None) -> tuple[th.Tensor, th.Tensor]:
+    def sample_latents(
+        self, features: th.Tensor, noise: th.Tensor | None = None, masks: th.Tensor | None = None
+    ) -> tuple[th.Tensor, th.Tensor]:
         """
         :param features: (B, features_dim)
         :param noise: noise of the discrete policy's chain, drawn if None
-        :return: latents (B, latent_dim) and the discrete actions (B,) that they decode to
+        :param masks: (B, K) False for discrete actions that may not be taken, None if all may
+        :return: latents (B, latent_dim) and the discrete actions (B,) that they decode to; latents of forbidden actions give
+            way to the nearest allowed codeword
         """
         latents = self.discrete_policy.sample(features, noise=noise)
-        return latents, self.codebook.quantize(latents)
+        k = self.codebook.quantize(latents, masks)
+        if masks is not None:
+            allowed = self.codebook.quantize(latents) == k
+            latents = th.where(allowed[:, None], latents, self.codebook.representative_latents(k))
+        return latents, k
 
     def condition(self, features: th.Tensor, codewords: th.Tensor) -> th.Tensor:
         """

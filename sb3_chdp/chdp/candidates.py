@@ -46,21 +46,30 @@ class Candidates(NamedTuple):
         batch_size = len(self.latents)
         return Candidates(*(th.cat([a, b.expand(batch_size, *b.shape[1:])], dim=1) for a, b in zip(self, others, strict=True)))
 
-    def best(self, critic: HybridCritic, features: th.Tensor) -> SelectedActions:
+    def best(self, critic: HybridCritic, features: th.Tensor, masks: th.Tensor | None = None) -> SelectedActions:
         """
         :param critic: twin critic
         :param features: (B, features_dim) features of the observations
-        :return: the candidates of highest min(Q1, Q2)
+        :param masks: (B, K) False for discrete actions that may not be taken, None if all may
+        :return: the candidates of highest min(Q1, Q2) among those that may be taken
         """
         batch_size, n = self.discrete_actions.shape
         latents, k, parameters = (part.flatten(0, 1) for part in self)
         q_values = th.min(*critic.q_values(features.repeat_interleave(n, dim=0), latents, parameters))
-        best = q_values.view(batch_size, n).argmax(dim=1) + th.arange(batch_size, device=features.device) * n
+        values = q_values.view(batch_size, n)
+        if masks is not None:
+            values = values.masked_fill(~masks.gather(1, self.discrete_actions), -th.inf)
+        best = values.argmax(dim=1) + th.arange(batch_size, device=features.device) * n
         return SelectedActions(latents[best], k[best], parameters[best], q_values[best])
 
 
 def drawn_candidates(
-    actor: CooperativeActor, features: th.Tensor, n: int, n_uniform: int, noise: tuple[th.Tensor, th.Tensor] | None = None
+    actor: CooperativeActor,
+    features: th.Tensor,
+    n: int,
+    n_uniform: int,
+    noise: tuple[th.Tensor, th.Tensor] | None = None,
+    masks: th.Tensor | None = None,
 ) -> Candidates:
     """
     Actions that the policies draw, and others of which the continuous policy draws the parameters alone.
@@ -72,10 +81,12 @@ def drawn_candidates(
         no more
     :param noise: noises of the chains of latents (N, B * n, latent_dim) and of parameters (N, B * (n_uniform + n), Pmax);
         None: draw
+    :param masks: (B, K) False for discrete actions that the discrete policy may not draw, None if it may draw all
     """
     batch_size, codebook, device = len(features), actor.codebook, features.device
     latent_noise, parameter_noise = (None, None) if noise is None else noise
-    latents, k = actor.sample_latents(features.repeat_interleave(n, dim=0), latent_noise)
+    masks = None if masks is None else masks.repeat_interleave(n, dim=0)
+    latents, k = actor.sample_latents(features.repeat_interleave(n, dim=0), latent_noise, masks)
     latents, k = latents.view(batch_size, n, -1), k.view(batch_size, n)
     if n_uniform > 0:
         first = th.randint(codebook.n_discrete_actions, (batch_size, 1), device=device) if noise is None else 0
@@ -142,6 +153,7 @@ class Selection:
         critic: HybridCritic,
         features: th.Tensor,
         noise: tuple[th.Tensor, th.Tensor] | None = None,
+        masks: th.Tensor | None = None,
     ) -> SelectedActions:
         """
         :param actor: the policies
@@ -149,11 +161,12 @@ class Selection:
         :param features: (B, features_dim) features of the observations
         :param noise: all that is random in the draws, see :func:`drawn_candidates`; random actions are the same every time
             then. None: draw
+        :param masks: (B, K) False for discrete actions that may not be taken, None if all may
         """
-        candidates = drawn_candidates(actor, features, self.n_drawn, self.n_uniform, noise)
+        candidates = drawn_candidates(actor, features, self.n_drawn, self.n_uniform, noise, masks)
         if self.n_random > 0:
             candidates = candidates.join(random_candidates(actor, len(features), self.n_random, noise is not None))
-        best = candidates.best(critic, features)
+        best = candidates.best(critic, features, masks)
         for spread in REFINEMENT_SPREADS if self.n_refined > 0 else ():
             best = varied_candidates(actor, best, self.n_refined, spread).best(critic, features)
         return best

@@ -81,6 +81,8 @@ class CHDP(HybridOffPolicyAlgorithm):
     :param policy_delay: policies and targets are updated once every ``policy_delay`` critic updates
     :param action_layout: how to read an ambiguous action space, "auto", "per_action" or "shared",
         see :class:`HybridActionSpec`
+    :param use_masking: whether to ask the environment for ``action_masks()`` and to take no discrete action that they forbid;
+        None: if it has such a method
     :param stats_window_size: number of episodes over which the logged success rate, length and reward are averaged
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments to be passed to the policy on creation, see :class:`CHDPPolicy`
@@ -142,6 +144,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         n_action_candidates: int = 8,
         policy_delay: int = 2,
         action_layout: str = "auto",
+        use_masking: bool | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -167,6 +170,7 @@ class CHDP(HybridOffPolicyAlgorithm):
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
             action_layout=action_layout,
+            use_masking=use_masking,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             policy_kwargs=policy_kwargs,
@@ -188,7 +192,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         return dict(n_diffusion_steps=self.n_diffusion_steps, n_action_candidates=self.n_action_candidates)
 
     def _make_hybrid_space(self) -> HybridBox:
-        return HybridBox(self.action_space, self.action_layout, self.latent_dim)
+        return HybridBox(self.action_space, self.action_layout, self.latent_dim, self._mask_parts())
 
     def _setup_model(self) -> None:
         if self.replay_buffer_class is None:
@@ -248,7 +252,9 @@ class CHDP(HybridOffPolicyAlgorithm):
 
                 # Step 1: discrete policy, eq. 7
                 parameters = self._parameters_of_latents(replay_data)
-                diffusion_loss, q_loss, weights = discrete_policy_loss(policy, replay_data, features, parameters, q_values if self.filters else None)
+                diffusion_loss, q_loss, weights = discrete_policy_loss(
+                    policy, replay_data, features, parameters, q_values if self.filters else None
+                )
                 loss = diffusion_loss + alpha * q_loss
                 gradient_step(loss, [policy.discrete_optimizer], self.max_grad_norm, "discrete_loss")
                 losses |= {"discrete_loss": loss, "diffusion_loss_discrete": diffusion_loss}
@@ -293,7 +299,8 @@ class CHDP(HybridOffPolicyAlgorithm):
         """
         n_uniform = round(self.uniform_fraction * len(features))
         with th.no_grad():
-            latents, k = self.actor.sample_latents(features[n_uniform:])
+            masks = None if replay_data.masks is None else replay_data.masks[n_uniform:]
+            latents, k = self.actor.sample_latents(features[n_uniform:], masks=masks)
             if n_uniform > 0:
                 uniform_latents, uniform_k, _ = self.actor.random_actions(n_uniform)
                 latents, k = th.cat([uniform_latents, latents]), th.cat([uniform_k, k])
@@ -302,9 +309,9 @@ class CHDP(HybridOffPolicyAlgorithm):
     def _exploration_rate(self) -> float:
         return exploration_rate(self.num_timesteps, self._episode_num, self.hybrid_space.spec.n_discrete_actions)
 
-    def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator, masks: np.ndarray | None = None) -> np.ndarray:
         assert self._last_obs is not None, "self._last_obs was not set"
-        return vary_parts(self.policy, self._last_obs, rows, rng)
+        return vary_parts(self.policy, self._last_obs, rows, rng, masks)
 
     def _update_learning_rates(self) -> None:
         """Set the learning rates of all optimizers according to their schedules."""

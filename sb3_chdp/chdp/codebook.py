@@ -19,12 +19,13 @@ class Codebook(nn.Module):
         self.n_discrete_actions, self.latent_dim = n_discrete_actions, latent_dim
         self.codewords = nn.Parameter(th.empty(n_discrete_actions, latent_dim).uniform_(-1, 1))
 
-    def quantize(self, latents: th.Tensor) -> th.Tensor:
+    def quantize(self, latents: th.Tensor, masks: th.Tensor | None = None) -> th.Tensor:
         """
         :param latents: (B, d_e)
+        :param masks: (B, K) False for discrete actions that may not be taken, None if all may
         :return: (B,) index k of the nearest codeword in squared Euclidean distance, the paper's eq. 12
         """
-        return nearest_row(latents, self.codewords)
+        return nearest_row(latents, self.codewords, masks)
 
     def forward(self, k: th.Tensor) -> th.Tensor:
         """

@@ -46,7 +46,11 @@ def random_parameters(rng: np.random.Generator, mask: np.ndarray) -> np.ndarray:
 
 
 def vary_parts(
-    policy: CHDPPolicy, observation: np.ndarray | dict[str, np.ndarray], rows: np.ndarray, rng: np.random.Generator
+    policy: CHDPPolicy,
+    observation: np.ndarray | dict[str, np.ndarray],
+    rows: np.ndarray,
+    rng: np.random.Generator,
+    masks: np.ndarray | None = None,
 ) -> np.ndarray:
     """
     Replace a part of each action, or all of it.
@@ -61,12 +65,13 @@ def vary_parts(
     :param observation: n observations
     :param rows: (n, columns) the policy's actions
     :param rng: random generator
+    :param masks: (n, K) False for discrete actions that may not be taken, None if all may
     :return: (n, columns) rows
     """
     n, spec, columns = len(rows), policy.action_space.spec, policy.action_space.columns
     kinds = rng.integers(4, size=(n, 1))
 
-    random = policy.random_rows(rng, n)
+    random = policy.random_rows(rng, n, masks)
     of_random_k = random.copy()
     with th.no_grad():
         features = policy.critic_target.features(policy.obs_to_tensor(observation)[0])

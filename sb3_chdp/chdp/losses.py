@@ -31,7 +31,7 @@ def target_values(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> th.Te
     :return: (B, 1) y in the units of the rewards
     """
     features = policy.critic_target.features(replay_data.next_observations)
-    next_actions = policy.select_target(policy.actor_target, policy.critic_target, features)
+    next_actions = policy.select_target(policy.actor_target, policy.critic_target, features, masks=replay_data.next_masks)
     next_values = policy.value_scale.values(next_actions.q_values)
     return replay_data.rewards + (1 - replay_data.dones) * replay_data.discounts * next_values
 
@@ -77,7 +77,7 @@ def discrete_policy_loss(
     latents = actor.discrete_policy.sample(features)
     if parameters is None:
         with th.no_grad():
-            parameters = actor.sample_parameters(features, actor.codebook.quantize(latents))
+            parameters = actor.sample_parameters(features, actor.codebook.quantize(latents, replay_data.masks))
     improved = policy.critic.q1_values(features, latents, parameters)
     weights = None if q_values is None else (q_values >= improved.detach()).float()
     diffusion_loss = actor.discrete_policy.diffusion_loss(replay_data.latents, features, weights=weights)
@@ -85,7 +85,12 @@ def discrete_policy_loss(
 
 
 def continuous_policy_loss(
-    policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, latents: th.Tensor, k: th.Tensor, weights: th.Tensor | None = None
+    policy: CHDPPolicy,
+    replay_data: HybridReplaySamples,
+    features: th.Tensor,
+    latents: th.Tensor,
+    k: th.Tensor,
+    weights: th.Tensor | None = None,
 ) -> tuple[th.Tensor, th.Tensor]:
     """
     Eq. 8, L_d - alpha Q1(s, e, a): Q of parameters a drawn through the whole chain; the gradient reaches the codebook through

@@ -104,6 +104,7 @@ class PaperCHDP(CHDP):
     :param eta: weight of the policy improvement terms relative to the diffusion losses
     :param codebook_lr_factor: learning rate of the codebook relative to that of the networks
     :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
+    :param use_masking: whether to obey ``action_masks()`` of the environment; None: if it has such a method
     :param stats_window_size: number of episodes over which the logged success rate, length and reward are averaged
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
     :param policy_kwargs: additional arguments to be passed to the policy on creation, see :class:`CHDPPolicy`
@@ -142,6 +143,7 @@ class PaperCHDP(CHDP):
         eta: float = 10.0,
         codebook_lr_factor: float = 0.1,
         action_layout: str = "auto",
+        use_masking: bool | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -170,6 +172,7 @@ class PaperCHDP(CHDP):
             n_action_candidates=1,
             policy_delay=1,
             action_layout=action_layout,
+            use_masking=use_masking,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             policy_kwargs=policy_kwargs,

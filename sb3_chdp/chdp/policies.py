@@ -156,7 +156,9 @@ class CHDPPolicy(HybridPolicy):
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(obs, deterministic)
 
-    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+    def _predict(
+        self, observation: PyTorchObs, deterministic: bool = False, action_masks: th.Tensor | None = None
+    ) -> th.Tensor:
         """
         Draw actions and keep the one of highest target min(Q1, Q2), see :class:`Selection`.
 
@@ -165,14 +167,14 @@ class CHDPPolicy(HybridPolicy):
         target policies, averages of the policies over the last updates, which do not waver as those do, and refine what
         they chose.
 
-        :return: (B, 1 + Pmax + latent_dim) rows
+        :return: (B, columns) rows
         """
         features = self.critic_target.features(observation)
         if deterministic:
             select, actor, noise = self.select_deterministic, self.actor_target, self._fixed_noise(observation)
         else:
             select, actor, noise = self.select, self.actor, None
-        latents, k, parameters, _ = select(actor, self.critic_target, features, noise)
+        latents, k, parameters, _ = select(actor, self.critic_target, features, noise, action_masks)
         return self.action_space.columns.pack(discrete_actions=k.float(), parameters=parameters, latents=latents)
 
     def _fixed_noise(self, observation: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
@@ -184,9 +186,9 @@ class CHDPPolicy(HybridPolicy):
             self.fixed_parameter_noise[:, chains.flatten()],
         )
 
-    def random_rows(self, rng: np.random.Generator, n: int) -> np.ndarray:
+    def random_rows(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
         """Uniformly random actions; their latents scatter around the codewords and decode to the actions."""
-        rows, columns = super().random_rows(rng, n), self.action_space.columns
+        rows, columns = super().random_rows(rng, n, masks), self.action_space.columns
         k = th.as_tensor(columns.discrete_actions(rows), device=self.device)
         codebook = self.actor.codebook
         centres = codebook.representative_latents(k)
