@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 
+from sb3_chdp import CHDP
 from sb3_chdp.chdp import PaperCHDP
 from sb3_chdp.chdp.value_scale import ValueScale
 from tests.algorithms import filled_model, sample
@@ -74,20 +75,19 @@ def test_values_stay_when_the_scale_changes(target):
 
 
 class Units(HybridIdentityEnv):
-    """Rewards in other units."""
+    """Rewards in other units; episodes go on if they do not end by success."""
 
-    def __init__(self, unit=1.0, offset=0.0):
+    def __init__(self, unit=1.0, offset=0.0, ends=True):
         super().__init__()
-        self.unit, self.offset = unit, offset
+        self.unit, self.offset, self.ends = unit, offset, ends
 
     def step(self, action):
-        obs, reward, *end = super().step(action)
-        return obs, self.unit * (reward + self.offset), *end
+        obs, reward, terminated, *end = super().step(action)
+        return obs, self.unit * (reward + self.offset), terminated and (self.ends or reward > 0), *end
 
 
-def trained(unit, algorithm_class=None, n_updates=30):
-    kwargs = {} if algorithm_class is None else dict(algorithm_class=algorithm_class)
-    model = filled_model(Units(unit), n_transitions=200, **kwargs)
+def trained(unit, algorithm_class=CHDP, n_updates=30, **kwargs):
+    model = filled_model(Units(unit, ends=False), algorithm_class, n_transitions=200, gamma=0.9, **kwargs)
     th.manual_seed(0)
     np.random.seed(0)
     model.train(n_updates, 32)
@@ -95,10 +95,11 @@ def trained(unit, algorithm_class=None, n_updates=30):
     return model
 
 
+@pytest.mark.parametrize("policy_delay", [1, 2])
 @pytest.mark.parametrize("unit", [1e-3, 1e4])
-def test_units_of_rewards_do_not_matter(unit):
+def test_units_of_rewards_do_not_matter(unit, policy_delay):
     """The same networks, the same actions, and values in the units of the rewards."""
-    models = [trained(1.0), trained(unit)]
+    models = [trained(unit, policy_delay=policy_delay) for unit in (1.0, unit)]
     obs = np.stack([Units().reset(seed=i)[0] for i in range(40)])
     outputs, actions, q_means = [], [], []
     for model in models:
