@@ -53,6 +53,9 @@ class ValueScale(nn.Module):
         :param terminations: (n,) whether they end an episode, other than by a time limit
         :param gamma: discount factor
         """
+        if self.n_transitions == 0:
+            # Until there are targets, values are the center: what untrained critics put out has no units
+            self.mean_square.zero_()
         self.n_transitions += len(rewards)
         weight = (len(rewards) / self.n_transitions).clamp(min=min(len(rewards) * MIN_TRANSITION_WEIGHT, 1.0))
         for mean, value in ((self.mean_reward, rewards.mean()), (self.mean_termination, terminations.mean())):
@@ -63,10 +66,11 @@ class ValueScale(nn.Module):
     def count_targets(self, targets: th.Tensor) -> float:
         """
         :param targets: (B, 1) targets of the critics, in the units of the rewards
-        :return: factor by which the critics' outputs have to be multiplied, so that the values stay what they were
+        :return: factor by which the critics' outputs have to be multiplied, so that the values stay what they were; 1 if there
+            was no scale yet
         """
-        before, first = self.scale, self.n_batches == 0
+        before = self.scale
         self.n_batches += 1
         weight = (1 / self.n_batches).clamp(min=MIN_BATCH_WEIGHT)
         self.mean_square.lerp_((targets - self.center).double().square().mean(), weight)
-        return 1.0 if first else float(before / self.scale)
+        return 1.0 if before <= MIN_SCALE else float(before / self.scale)
