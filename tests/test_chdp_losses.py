@@ -1,5 +1,7 @@
 """The losses of CHDP: who gets gradient from what, and what the targets are made of."""
 
+import itertools
+
 import pytest
 import torch as th
 from torch.nn import functional as F
@@ -94,7 +96,7 @@ def test_each_step_moves_its_own_networks_only(algorithm_class):
     snapshot()
     moved = [
         {name for name in after if any((p != q).any() for p, q in zip(after[name], before[name], strict=True))}
-        for before, after in zip(states, states[1:], strict=False)
+        for before, after in itertools.pairwise(states)
     ]
     critics_train = {"critic", "codebook"} if algorithm_class is CHDP else {"critic"}
     assert moved == [critics_train, {"discrete"}, {"continuous", "codebook"}]

@@ -1,5 +1,7 @@
 """The training of CHDP as a whole: what is updated when, from which batches, and what is logged."""
 
+import itertools
+
 import numpy as np
 import pytest
 import torch as th
@@ -170,7 +172,7 @@ def test_padding_reaches_nothing():
     model.train(2, 32)
     rows = model.policy.predict_rows(np.random.uniform(-1, 1, (200, 2)).astype(np.float32))
     assert all(calls)
-    for _, latents, parameters in sum(calls, []):
+    for _, latents, parameters in itertools.chain(*calls):
         k = model.actor.codebook.quantize(latents)
         assert not parameters[~mask[k]].any() and parameters.abs().max() <= 1 and latents.abs().max() <= 1
     k = columns.discrete_actions(rows)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
-from sb3_chdp.chdp.policies import CHDPPolicy
+from sb3_chdp import CHDP
 from sb3_chdp.common.normalization import NormalizedCombinedExtractor, NormalizedExtractor, RunningNormalization
 from tests.algorithms import fast_model
 from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, layouts
@@ -110,7 +111,8 @@ def test_late_batches_change_little():
 
 
 def test_dict_observations():
-    space = spaces.Dict(vector=box(-np.inf, np.inf, 3), choice=spaces.Discrete(4), image=spaces.Box(0, 255, (3, 36, 36), np.uint8))
+    image = spaces.Box(0, 255, (3, 36, 36), np.uint8)
+    space = spaces.Dict(vector=box(-np.inf, np.inf, 3), choice=spaces.Discrete(4), image=image)
     extractor = NormalizedCombinedExtractor(space, cnn_output_dim=16)
     assert extractor.features_dim == 2 * 3 + 2 * 4 + 16
     observations = {
@@ -152,7 +154,7 @@ def extractors(model):
 def test_in_a_policy(policy, tmp_path):
     """Training counts, targets take over, predictions count nothing, and files keep the statistics."""
     env = env_of_units(1e4, 10.0, policy == "MultiInputPolicy")
-    model = type(fast_model())(policy, env, learning_starts=20, n_diffusion_steps=2, seed=0).learn(60)
+    model = CHDP(policy, env, learning_starts=20, n_diffusion_steps=2, seed=0).learn(60)
     online, target = (extractor.state_dict() for extractor in extractors(model))
     (mean_name,) = [name for name in online if name.endswith("running_mean")]
     np.testing.assert_allclose(online[mean_name], 1e5, rtol=0.03)
@@ -167,7 +169,7 @@ def test_in_a_policy(policy, tmp_path):
     assert all(th.equal(value, before[name]) for name, value in extractors(model)[1].state_dict().items())
     model.save(tmp_path / "model")
     model.policy.save(tmp_path / "policy")
-    for loaded in (type(model).load(tmp_path / "model"), type(model.policy).load(tmp_path / "policy")):
+    for loaded in (CHDP.load(tmp_path / "model"), type(model.policy).load(tmp_path / "policy")):
         for one, action in zip(obs, actions, strict=True):
             np.testing.assert_equal(loaded.predict(one, deterministic=True)[0], action)
 
@@ -179,8 +181,6 @@ def test_targets_take_over_the_statistics_of_each_update():
 
 
 def test_another_extractor_may_take_its_place():
-    from stable_baselines3.common.torch_layers import FlattenExtractor
-
     model = fast_model(policy_kwargs=dict(features_extractor_class=FlattenExtractor, net_arch=[16])).learn(40)
-    assert isinstance(model.policy, CHDPPolicy) and model.critic.features_extractor.features_dim == 4
+    assert model.critic.features_extractor.features_dim == 4
     assert not any(isinstance(module, RunningNormalization) for module in model.policy.modules())

@@ -1,5 +1,7 @@
 """PaperCHDP: what the published algorithm does otherwise."""
 
+import inspect
+
 import numpy as np
 import pytest
 import torch as th
@@ -97,9 +99,8 @@ def test_gradients_are_bounded():
     """With rewards of any size; Adam, which would hide it, is not used."""
     steps = {}
     for algorithm_class in (PaperCHDP, CHDP):
-        model = filled_model(
-            algorithm_class=algorithm_class, policy_kwargs=dict(net_arch=[16], optimizer_class=th.optim.SGD, optimizer_kwargs={})
-        )
+        policy_kwargs = dict(net_arch=[16], optimizer_class=th.optim.SGD)
+        model = filled_model(algorithm_class=algorithm_class, policy_kwargs=policy_kwargs)
         model.replay_buffer.rewards[:] *= 1e4
         model.replay_buffer.rewards[:] += 1e4
         before = [p.detach().clone() for p in model.critic.parameters()]
@@ -111,7 +112,5 @@ def test_gradients_are_bounded():
 
 
 def test_arguments_are_a_part_of_chdps():
-    import inspect
-
     arguments, of_chdp = (inspect.signature(algorithm).parameters for algorithm in (PaperCHDP, CHDP))
     assert [name for name in of_chdp if name in arguments] == list(arguments)
