@@ -73,9 +73,9 @@ def test_codewords_stay_apart_where_all_actions_are_worth_the_same(reward):
             return obs, reward, *end
 
     env = ConstantEnv(spaces.Tuple((spaces.Discrete(8), box(-1, 1, 1))))
-    model = CHDP("MlpPolicy", env, seed=0, learning_starts=100, policy_kwargs=dict(net_arch=[32, 32]))
+    model = filled_model(env, n_transitions=300, latent_dim=8)
     before = th.pdist(model.actor.codebook.codewords.detach())
-    model.learn(1500)
+    model.train(1500, 32)
     for actor in (model.actor, model.actor_target):
         codewords = actor.codebook.codewords.detach()
         assert (actor.codebook.quantize(codewords) == th.arange(8)).all()
