@@ -131,13 +131,12 @@ def conversion(repeats: int) -> Iterator[str]:
 
 
 def step(repeats: int) -> Iterator[str]:
-    """(a) gradient step of CHDP against SB3's TD3, both with batches of 128; TD3 on the flattened environment, 2 x 256"""
+    """(a) gradient step against SB3's TD3, all with batches of 128; TD3 on the flattened environment, 2 x 256"""
     cases: list[tuple[str, type[BaseAlgorithm], int, dict[str, Any]]] = [
-        # Every other step of TD3 updates its policy
+        # Every other step of TD3 and of CHDP updates policies
         ("SB3's TD3", TD3, 2, dict(wrapper=FlattenHybridAction, policy_kwargs=dict(net_arch=[256, 256]))),
-        ("CHDP, defaults", CHDP, 1, {}),
-        ("CHDP, N = 5", CHDP, 1, dict(n_diffusion_steps=5)),
-        ("CHDP, N = 5, 2 x 256", CHDP, 1, dict(n_diffusion_steps=5, policy_kwargs=BIG)),
+        ("CHDP", CHDP, 2, {}),
+        ("CHDP, 2 x 256", CHDP, 2, dict(policy_kwargs=BIG)),
         ("PaperCHDP", PaperCHDP, 1, {}),
     ]
     models = [build(algorithm, **kwargs) for _, algorithm, _, kwargs in cases]
@@ -149,13 +148,13 @@ def step(repeats: int) -> Iterator[str]:
 
 
 def matrix_products(repeats: int) -> Iterator[str]:
-    """(b) distance to the matrix products of a step, which are run once more on their own"""
-    yield "| configuration | step, ms | its matrix products alone, ms | ratio |\n|---|---|---|---|"
+    """(b) distance to the matrix products of two steps of CHDP, which are run once more on their own"""
+    yield "| configuration | two steps, ms | their matrix products alone, ms | ratio |\n|---|---|---|---|"
     for name, batch_size, kwargs in (("defaults", 128, None), ("2 x 256", 256, BIG)):
         model = build(CHDP, policy_kwargs=kwargs)
         model.train(2, batch_size)
         with profile(activities=[ProfilerActivity.CPU], record_shapes=True) as record:
-            model.train(1, batch_size)
+            model.train(2, batch_size)
         # Where an operation has its two factors; what comes after them is where the product is put
         first = {"aten::mm": 0, "aten::addmm": 1, "aten::addmm_": 1}
         shapes = [
@@ -170,18 +169,19 @@ def matrix_products(repeats: int) -> Iterator[str]:
             for a, b in products:
                 th.mm(a, b)
 
-        whole, floor = medians([lambda m=model, b=batch_size: m.train(1, b), only_products], repeats)
+        whole, floor = medians([lambda m=model, b=batch_size: m.train(2, b), only_products], repeats)
         label = f"{name}, batch {batch_size}: {len(products)} products"
         yield f"| {label} | {1e3 * whole:.1f} | {1e3 * floor:.1f} | {whole / floor:.1f} |"
 
 
 def predict(repeats: int) -> Iterator[str]:
-    """(c) acting, deterministic, CHDP with the best of 16 candidates"""
-    yield "| observations | CHDP, ms | CHDP, N = 5, ms | SB3's TD3, ms |\n|---|---|---|---|"
-    models = [build(CHDP), build(CHDP, n_diffusion_steps=5), build(TD3, wrapper=FlattenHybridAction)]
+    """(c) acting: CHDP chooses among candidates, and refines its choice in deterministic predictions"""
+    yield "| observations | CHDP, ms | CHDP, deterministic, ms | PaperCHDP, ms | SB3's TD3, ms |\n|---|---|---|---|---|"
+    chdp, paper, td3 = build(CHDP), build(PaperCHDP), build(TD3, wrapper=FlattenHybridAction)
+    cases = [(chdp, False), (chdp, True), (paper, True), (td3, True)]
     for n in (1, 8, 64):
         obs = np.random.default_rng(0).uniform(-1, 1, (n, 4)).astype(np.float32)
-        seconds = medians([lambda m=m, o=obs: m.predict(o, deterministic=True) for m in models], repeats)
+        seconds = medians([lambda m=m, d=d, o=obs: m.predict(o, deterministic=d) for m, d in cases], repeats)
         yield f"| {n} | " + " | ".join(f"{1e3 * value:.2f}" for value in seconds) + " |"
 
 
@@ -190,20 +190,20 @@ def discrete_actions(repeats: int) -> Iterator[str]:
     yield "| K | gradient step, ms | ratio to K = 4 |\n|---|---|---|"
     sizes = (4, 64, 1024, 65_536)
     models = [build(CHDP, lambda k=k: ManyActions(k)) for k in sizes]
-    seconds = medians([lambda m=m: m.train(1, 128) for m in models], repeats)
+    seconds = medians([lambda m=m: m.train(2, 128) for m in models], repeats)
     for k, value in zip(sizes, seconds, strict=True):
-        yield f"| {k:,} | {1e3 * value:.1f} | {value / seconds[0]:.2f} |"
+        yield f"| {k:,} | {1e3 * value / 2:.1f} | {value / seconds[0]:.2f} |"
 
 
 def baselines(repeats: int) -> Iterator[str]:
-    """(g) gradient step of every algorithm; networks of 2 x 256, batch 128 (CHDP: its defaults)"""
+    """(g) gradient step of every algorithm; networks of 2 x 256, batch 128 (CHDP, PaperCHDP: their defaults)"""
     rows: list[tuple[str, Callable[[], object], int]] = []
     settings = dict(policy_kwargs=dict(net_arch=[256, 256]))
     rows.append(("SB3's TD3", build(TD3, wrapper=FlattenHybridAction, **settings), 2))
-    rows += [(name, build(algorithm, **settings), 2) for name, algorithm in off_policy().items() if algorithm is not CHDP]
+    others = {name: algorithm for name, algorithm in off_policy().items() if not issubclass(algorithm, CHDP)}
+    rows += [(name, build(algorithm, **settings), 2) for name, algorithm in others.items()]
     rows.append(("PDQN-TD3, multi_pass", build(PDQNTD3, multi_pass=True, **settings), 2))
-    rows.append(("CHDP", build(CHDP), 1))
-    rows.append(("CHDP, N = 5", build(CHDP, n_diffusion_steps=5), 1))
+    rows += [("CHDP", build(CHDP), 2), ("PaperCHDP", build(PaperCHDP), 1)]
     seconds = medians([lambda m=model, n=n: m.train(n, 128) for _, model, n in rows], repeats)  # type: ignore[attr-defined]
     per_step = [value / n for value, (_, _, n) in zip(seconds, rows, strict=True)]
     env = make_vec_env(ENV_ID, 8, seed=0)
@@ -217,14 +217,12 @@ def baselines(repeats: int) -> Iterator[str]:
 
 
 def loop(repeats: int) -> Iterator[str]:
-    """(f) the whole training loop of CHDP with the settings of its YAML file, and where its time goes"""
+    """(f) the whole training loop of CHDP, one gradient step for two environment steps, and where its time goes"""
     yield "| environments | steps/s | gradient steps per step | acting | environment | buffer | update | rest |"
     yield "|---|---|---|---|---|---|---|---|"
     for n_envs in (1, 8):
         shares = dict.fromkeys(("acting", "environment", "buffer", "update"), 0.0)
-        # One gradient step for two environment steps, as the YAML file has it
-        settings = dict(n_diffusion_steps=5, train_freq=max(2 // n_envs, 1), exploration_initial_eps=0.05)
-        model = build(CHDP, n_envs=n_envs, **settings)
+        model = build(CHDP, n_envs=n_envs, train_freq=max(2 // n_envs, 1))
         model.gradient_steps = max(n_envs // 2, 1)
 
         def timed(owner: Any, method: str, name: str, shares: dict[str, float] = shares) -> None:

@@ -5,6 +5,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_chdp import ALGORITHMS as REGISTRY
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import PaperCHDP
+from sb3_chdp.common.samples import name_columns
 from tests.hybrid_envs import HybridIdentityEnv, layouts
 
 OFF_POLICY = dict(batch_size=8, learning_starts=12, buffer_size=500)
@@ -19,7 +20,7 @@ for name, line in REGISTRY.items():
     algorithm = line.load_class()
     SMALL[algorithm] = {**(OFF_POLICY if issubclass(algorithm, OffPolicyAlgorithm) else ON_POLICY), **OWN.get(name, {})}
 ALGORITHMS = list(SMALL)
-# PaperCHDP has no arguments of exploration; what it does instead is in test_chdp.py
+# PaperCHDP has no arguments of exploration; what it does instead is in test_paper_chdp.py
 OFF_POLICY_ALGORITHMS = [
     algorithm for algorithm in ALGORITHMS if issubclass(algorithm, OffPolicyAlgorithm) and algorithm is not PaperCHDP
 ]
@@ -40,20 +41,36 @@ def has_learnt(model, before):
     return any((p != before[name]).any() for name, p in model.policy.named_parameters())
 
 
+# A constant learning rate: the default falls to 0 in the training that fills the buffer
 FAST_CHDP = dict(
-    n_diffusion_steps=3, latent_dim=4, batch_size=16, learning_starts=20, n_action_candidates=2, buffer_size=1000,
-    policy_kwargs=dict(net_arch=[16, 16]), seed=0,
+    n_diffusion_steps=3, latent_dim=4, batch_size=16, learning_starts=20, learning_rate=1e-3, n_action_candidates=2,
+    buffer_size=1000, policy_kwargs=dict(net_arch=[16, 16]), seed=0,
 )  # fmt: skip
-
-
 # PaperCHDP has no candidates
 PAPER_FAST = {key: value for key, value in FAST_CHDP.items() if key != "n_action_candidates"}
 
 
-def filled_model(env=None, algorithm_class=CHDP, **kwargs):
-    """A model of CHDP, or of a class derived from it, with 60 random transitions that has not been trained."""
+def fast_model(algorithm_class=CHDP, env=None, **kwargs):
+    """A small model of CHDP, or of a class derived from it."""
     settings = PAPER_FAST if issubclass(algorithm_class, PaperCHDP) else FAST_CHDP
-    model = algorithm_class("MlpPolicy", env or HybridIdentityEnv(), **{**settings, **kwargs})
+    return algorithm_class("MlpPolicy", env or HybridIdentityEnv(), **{**settings, **kwargs})
+
+
+def filled_model(env=None, algorithm_class=CHDP, n_transitions=60, **kwargs):
+    """The same with random transitions in its buffer, not trained."""
+    model = fast_model(algorithm_class, env, **kwargs)
     model.learning_starts = 10**9
-    model.learn(60)
+    model.learn(n_transitions)
     return model
+
+
+def sample(model, batch_size=32):
+    """:return: a batch of the model's replay buffer"""
+    return name_columns(model.replay_buffer.sample(batch_size), model.hybrid_space, model.gamma)
+
+
+def calls_of(module):
+    """:return: a list that takes up the arguments of every further call of a network"""
+    calls = []
+    module.register_forward_pre_hook(lambda _, args: calls.append([arg.detach().clone() for arg in args]))
+    return calls

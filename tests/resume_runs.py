@@ -16,12 +16,10 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
-from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_chdp
 from sb3_chdp.common import checkpoint_store, replay_store
-from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.resume import ResumableCheckpoint, resume
 from tests.algorithms import make_model
 from tests.hybrid_envs import UNIT
@@ -81,7 +79,7 @@ def make_env(n_envs, folder=None, env_class=ResumableWalkEnv, normalize=False, v
 
 # Algorithm, number of environments and settings: each setting that has a state of its own is on in one of them
 RUNS = {
-    "CHDP-1": dict(replay_buffer_class=PrioritizedReplayBuffer, policy_kwargs=dict(net_arch=[8], whitening=True)),
+    "CHDP-1": {},
     "CHDP-4": dict(n_steps=3),
     "HPPO-1": {},
     "HPPO-4": {},
@@ -152,11 +150,9 @@ def result(model, folder):
             content = str(value).encode() if array.dtype.hasobject else array.tobytes()
             parts[name] = hashlib.sha256(content + str(array.dtype).encode()).hexdigest()[:16]
 
-    for name in model._get_torch_save_params()[0]:
-        add(name, recursive_getattr(model, name).state_dict())
+    add("parameters", model.get_parameters())
     if model.__dict__.get("replay_buffer") is not None:
         add("buffer", {k: v for k, v in vars(model.replay_buffer).items() if isinstance(v, (np.ndarray, int, float, bool))})
-    add("n_updates", model._n_updates)
     add("num_timesteps", model.num_timesteps)
     add("last_obs", model._last_obs)
     add("generators", [th.get_rng_state(), np.random.get_state()[1], str(model.action_space.np_random.bit_generator.state)])

@@ -8,10 +8,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chdp import CHDP
-from sb3_chdp.chdp import losses
 from sb3_chdp.common import buffers
 from sb3_chdp.common.buffers import PRIORITY_EPSILON, PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
-from tests.algorithms import FAST_CHDP
+from tests.algorithms import FAST_CHDP, filled_model
 from tests.hybrid_envs import HybridIdentityEnv, make_layout_env
 
 BOX = spaces.Box(-np.inf, np.inf, (2,))
@@ -109,37 +108,26 @@ def test_observations_in_a_dict_are_normalised():
 
 
 def test_chdp_sets_priorities_to_the_errors_of_its_critics(tmp_path):
+    """The larger error of both critics, before their step, in their own units."""
     env = make_vec_env(HybridIdentityEnv, 2, seed=0)
-    settings = dict(FAST_CHDP, replay_buffer_class=PrioritizedReplayBuffer, replay_buffer_kwargs=dict(alpha=1.0))
-    model = CHDP("MlpPolicy", env, **settings).learn(100)
-    buffer = model.replay_buffer
+    model = filled_model(env, n_transitions=100, learning_rate=0.0, replay_buffer_kwargs=dict(alpha=1.0))
+    buffer, columns = model.replay_buffer, model.hybrid_space.columns
     assert isinstance(buffer, PrioritizedReplayBuffer) and buffer.alpha == 1
-    data = model._sample_batch(16)
-    loss, _, errors = losses.critic_loss(model.policy, data, 1)
-    q1, q2 = model.critic.q_values(data.observations, data.latents, data.parameters)
-    # Episodes of one step: the reward is the target
-    both = th.cat([q1, q2], dim=1) - data.rewards
-    th.testing.assert_close(errors, both.abs().max(dim=1).values.detach())
-    th.testing.assert_close(loss, (data.weights * both**2).mean() * 2)
-
-    # A gradient step leaves the errors that its critics had before it
-    model.learning_rate = 0.0
-    model._setup_lr_schedule()
     buffer.priorities[:50] = 7.0
     model.train(1, 16)
     changed = buffer.priorities[:50] != 7
     assert 0 < changed.sum() <= 16
-    k, parameters, latents = (
-        th.as_tensor(model.hybrid_space.columns.view(buffer.actions[:50], name)[changed])
-        for name in ("discrete_actions", "parameters", "latents")
+    # Random latents, which decode to their actions, are as they were stored
+    latents, parameters = (
+        th.as_tensor(columns.view(buffer.actions[:50], name)[changed]) for name in ("latents", "parameters")
     )
-    latents = th.where(
-        (model.actor.codebook.quantize(latents) == k[:, 0])[:, None],
-        latents, model.actor.codebook.representative_latents(k[:, 0].long()),
-    )  # fmt: skip
+    model.policy.set_training_mode(False)
     with th.no_grad():
-        q_values = th.cat(model.critic.q_values(th.as_tensor(buffer.observations[:50][changed]), latents, parameters), dim=1)
-    expected = (q_values - th.as_tensor(buffer.rewards[:50][changed])[:, None]).abs().max(dim=1).values
+        features = model.critic.features(th.as_tensor(buffer.observations[:50][changed]))
+        q_values = th.cat(model.critic.q_values(features, latents, parameters), dim=1)
+    # Episodes of one step: the reward is the target
+    targets = model.policy.value_scale.outputs(th.as_tensor(buffer.rewards[:50][changed])[:, None])
+    expected = (q_values - targets).abs().max(dim=1).values
     np.testing.assert_allclose(buffer.priorities[:50][changed], expected + PRIORITY_EPSILON, rtol=1e-4)
 
     model.save(tmp_path / "model")
@@ -152,7 +140,7 @@ def test_chdp_sets_priorities_to_the_errors_of_its_critics(tmp_path):
 
 def test_chdp_prioritises_transitions_with_dict_observations():
     env = make_layout_env(observation_space=spaces.Dict(vector=spaces.Box(-1, 1, (2,))))
-    model = CHDP("MultiInputPolicy", env, **FAST_CHDP, replay_buffer_class=PrioritizedDictReplayBuffer).learn(60)
+    model = CHDP("MultiInputPolicy", env, **FAST_CHDP).learn(60)
     assert isinstance(model.replay_buffer, PrioritizedDictReplayBuffer)
     assert len(np.unique(model.replay_buffer.priorities[:60])) > 10, "they are updated"
 

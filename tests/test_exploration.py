@@ -1,4 +1,6 @@
-"""Exploration of the parts of a hybrid action (CHDP's ``explore_parts``)."""
+"""When CHDP explores, and what its exploratory actions are."""
+
+import inspect
 
 import numpy as np
 import pytest
@@ -7,9 +9,68 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chdp import CHDP
-from sb3_chdp.chdp.exploration import random_parameters, reflect, vary_parts
-from tests.algorithms import FAST_CHDP, filled_model
-from tests.hybrid_envs import box, make_layout_env
+from sb3_chdp.chdp import exploration
+from sb3_chdp.chdp.exploration import exploration_rate, random_parameters, reflect, vary_parts
+from tests.algorithms import fast_model, filled_model, has_learnt, snapshot
+from tests.hybrid_envs import LayoutEnv, box, layouts, make_layout_env
+
+
+def test_the_rate_falls():
+    rates = [exploration_rate(n, n // 1000, 4) for n in (0, 10, 100, 1000, 10_000, 100_000)]
+    assert rates[0] == 1 and np.all(np.diff(rates) < 0) and rates[-1] < 0.1
+
+
+@pytest.mark.parametrize("n_actions", [2, 1000])
+def test_half_of_it_is_left_when_the_half_life_is_over(n_actions):
+    half_life = exploration.HALF_LIFE + n_actions * exploration.HALF_LIFE_PER_ACTION
+    assert exploration_rate(half_life, 0, n_actions) == pytest.approx(0.5)
+
+
+def test_more_discrete_actions_take_longer():
+    assert exploration_rate(5000, 0, 1000) > exploration_rate(5000, 0, 10) > exploration_rate(5000, 0, 2)
+
+
+def test_some_actions_of_an_episode_keep_exploring():
+    """The same number whether episodes are of 20 or 200 steps, but a share at most if they are short."""
+    n = 10**7
+    per_episode = [length * exploration_rate(n, n // length, 4) for length in (20, 50, 200)]
+    np.testing.assert_allclose(per_episode, exploration.ACTIONS_PER_EPISODE, rtol=1e-3)
+    assert exploration_rate(n, n, 4) == exploration_rate(n, n // 2, 4) == exploration.MAX_FINAL_RATE < 1
+    # Endless episodes end it
+    assert exploration_rate(n, 0, 4) < 0.01
+
+
+def test_it_follows_from_the_steps_whatever_the_length_of_the_training():
+    rates = []
+    for total in (60, 600):
+        model = fast_model(env=make_layout_env(), gradient_steps=0)
+        seen = []
+
+        def note(local_values, _, model=model, seen=seen):
+            seen.append(model.logger.name_to_value.get("rollout/exploration_rate"))
+            return len(seen) < 60
+
+        model.learn(total, callback=note, log_interval=10**6)
+        rates.append(seen[1:])
+    assert rates[0] == rates[1] and None not in rates[0]
+    assert rates[0][-1] < rates[0][0] <= 1
+
+
+def test_nobody_needs_to_set_it():
+    assert not [name for name in inspect.signature(CHDP).parameters if "explor" in name]
+
+
+def test_exploratory_actions_take_the_place_of_the_policy():
+    """Parts of them lie on the bounds often, which neither uniformly random actions nor the policies do."""
+    env = LayoutEnv(layouts()["shared"], episode_length=200)
+    model = filled_model(env, n_transitions=200, gradient_steps=0)
+    model.learning_starts = 0
+    model.learn(200, reset_num_timesteps=False)
+    columns = model.hybrid_space.columns
+    on_bounds = np.abs(columns.view(model.replay_buffer.actions[:400, 0], "parameters")) == 1
+    assert not on_bounds[:200].any()
+    predicted = columns.view(model.policy.predict_rows(model.replay_buffer.observations[:400, 0]), "parameters")
+    assert on_bounds[200:].mean() > 0.05 + (np.abs(predicted) == 1).mean()
 
 
 def test_reflect():
@@ -17,14 +78,16 @@ def test_reflect():
     np.testing.assert_allclose(reflect(x), [1.0, -0.75, -1.0, 0.5, 0.5, -1.0])
 
 
-def test_half_of_the_random_parameters_are_bounds():
+def test_random_parameters_are_uniform_or_bounds():
     mask = np.ones((20_000, 2))
     mask[:, 1] = 0
     first, padding = random_parameters(np.random.default_rng(0), mask).T
     assert not padding.any()
-    assert (first == -1).mean() == pytest.approx(0.25, abs=0.02)
-    assert (first == 1).mean() == pytest.approx(0.25, abs=0.02)
-    assert (np.abs(first) < 0.5).mean() == pytest.approx(0.25, abs=0.02)
+    lower, upper = (first == -1).mean(), (first == 1).mean()
+    assert lower == pytest.approx(upper, abs=0.02) and 0.05 < lower < 0.3
+    inside = first[np.abs(first) < 1]
+    histogram = np.histogram(inside, bins=8, range=(-1, 1))[0] / len(inside)
+    np.testing.assert_allclose(histogram, 1 / 8, atol=0.015)
 
 
 def test_each_part_is_varied():
@@ -51,10 +114,10 @@ def test_each_part_is_varied():
 
 
 @pytest.mark.parametrize("policy", ["MlpPolicy", "MultiInputPolicy"])
-def test_explore_parts_learns_and_saves(policy, tmp_path):
+def test_several_environments_explore(policy):
     observation_space = spaces.Dict({"vector": box(-1, 1, 2)}) if policy == "MultiInputPolicy" else None
     env = DummyVecEnv([lambda: make_layout_env(observation_space=observation_space)] * 3)
-    model = CHDP(policy, env, explore_parts=True, **FAST_CHDP).learn(60)
-    assert model._n_updates > 0
-    model.save(tmp_path / "model")
-    assert CHDP.load(tmp_path / "model").explore_parts
+    model = CHDP(policy, env, n_diffusion_steps=2, learning_starts=10, seed=0)
+    before = snapshot(model)
+    model.learn(60)
+    assert has_learnt(model, before)

@@ -89,6 +89,6 @@ def test_action_noise_of_the_user(off_policy_algorithm, n_envs):
     noise = NormalActionNoise(np.zeros(size), np.full(size, 0.3))
     make_model(off_policy_algorithm, env, action_noise=noise).learn(30)
     wrong = NormalActionNoise(np.zeros(size + 1), np.full(size + 1, 0.3))
-    model = make_model(off_policy_algorithm, env, action_noise=wrong, exploration_initial_eps=0, exploration_final_eps=0)
+    model = make_model(off_policy_algorithm, env, action_noise=wrong)
     with pytest.raises(ValueError, match=f"action_noise must have size {size} per environment"):
         model.learn(30)

@@ -18,6 +18,7 @@ import pandas as pd
 
 from benchmarks.probes.rollout import FIGURES, load_model, make_env, parser_of, play
 from sb3_chdp import HyARTD3
+from sb3_chdp.chdp.candidates import Selection
 from sb3_chdp.envs.hard_move import motion_table
 
 ENV_ID = "HardMove6-v0"
@@ -70,7 +71,8 @@ def main() -> None:
     parser_of(__doc__).parse_args()
     chdp, env = load_model(ENV_ID), make_env(ENV_ID, max_episode_steps=1)
     as_it_acts = draw_actions(chdp, env)
-    chdp.policy.n_action_candidates, chdp.policy.n_random_candidates = 1, 0
+    # What the policies draw, without the choice among candidates
+    chdp.policy.select = Selection(n_drawn=1)
     draws = {"CHDP": draw_actions(chdp, env), "CHDP, as it acts": as_it_acts}
     draws["HyAR-TD3"] = draw_actions(load_model(ENV_ID, HyARTD3), env)
     print(markdown(draws))

@@ -237,6 +237,7 @@ class CHDP(HybridOffPolicyAlgorithm):
             if self.scales_values:
                 policy.rescale_values(targets)
             features = policy.critic.features(replay_data.observations)
+            self.update_targets.copy_statistics()
             loss, q_values, errors = critic_loss(policy, replay_data, features, policy.value_scale.outputs(targets))
             gradient_step(loss, critic_optimizers, self.max_grad_norm, "critic_loss")
             policy.actor.codebook.project()

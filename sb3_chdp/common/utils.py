@@ -39,6 +39,11 @@ class TargetUpdate:
         :param tau: soft update coefficient in [0, 1]
         """
         th._foreach_lerp_(self.target_params, self.params, tau)
+        self.copy_statistics()
+
+    @th.no_grad()
+    def copy_statistics(self) -> None:
+        """The targets take over running statistics alone."""
         if self.batch_norm_stats:
             th._foreach_copy_(self.batch_norm_stats_target, self.batch_norm_stats)
 

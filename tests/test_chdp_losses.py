@@ -1,0 +1,200 @@
+"""The losses of CHDP: who gets gradient from what, and what the targets are made of."""
+
+import itertools
+
+import pytest
+import torch as th
+from torch.nn import functional as F
+
+from sb3_chdp import CHDP
+from sb3_chdp.chdp import PaperCHDP, losses
+from tests.algorithms import calls_of, filled_model, sample
+
+BOTH = pytest.mark.parametrize("algorithm_class", [CHDP, PaperCHDP])
+
+
+def networks(model):
+    actor = model.actor
+    reads = [] if actor.reads is None else list(actor.reads.parameters())
+    return {
+        "discrete": list(actor.discrete_policy.parameters()),
+        "continuous": [*actor.continuous_policy.parameters(), *reads],
+        "codebook": list(actor.codebook.parameters()),
+        "critic": list(model.critic.parameters()),
+    }
+
+
+def networks_with_gradient(model, loss):
+    result = set()
+    for name, params in networks(model).items():
+        gradients = th.autograd.grad(loss, params, retain_graph=True, allow_unused=True)
+        if any(g is not None and g.abs().max() > 0 for g in gradients):
+            result.add(name)
+    return result
+
+
+def all_losses(model, parameters="drawn"):
+    data, policy = sample(model), model.policy
+    features = policy.critic.features(data.observations)
+    targets = policy.value_scale.outputs(losses.target_values(policy, data))
+    critic, *_ = losses.critic_loss(policy, data, features, targets)
+    features = features.detach()
+    stored = data.parameters if parameters == "stored" else None
+    discrete = losses.discrete_policy_loss(policy, data, features, stored)
+    with th.no_grad():
+        latents, k = policy.actor.sample_latents(features)
+    continuous = losses.continuous_policy_loss(policy, data, features, latents, k)
+    return {
+        "critic": critic,
+        "discrete diffusion": discrete[0],
+        "discrete improvement": discrete[1],
+        "continuous diffusion": continuous[0],
+        "continuous improvement": continuous[1],
+    }
+
+
+# Which networks each loss can reach. The critic is reached by the improvement losses as well, but no optimizer that steps on
+# them holds its parameters
+GRADIENTS = {
+    "critic": {"critic", "codebook"},
+    "discrete diffusion": {"discrete"},
+    "discrete improvement": {"discrete", "critic"},
+    "continuous diffusion": {"continuous"},
+    "continuous improvement": {"continuous", "codebook", "critic"},
+}
+
+
+@pytest.mark.parametrize("parameters", ["drawn", "stored"])
+@BOTH
+@pytest.mark.parametrize("loss", GRADIENTS)
+def test_gradient_routing(loss, algorithm_class, parameters):
+    model = filled_model(algorithm_class=algorithm_class)
+    assert networks_with_gradient(model, all_losses(model, parameters)[loss]) == GRADIENTS[loss]
+
+
+@BOTH
+def test_codebook_gradient_comes_through_the_continuous_chain_only(algorithm_class):
+    """With a chain that ignores its condition the codebook gets no gradient, though Q depends on everything."""
+    model = filled_model(algorithm_class=algorithm_class)
+    with th.no_grad():
+        model.actor.continuous_policy.noise_predictor.split_first_layer()[2].zero_()
+    assert "codebook" not in networks_with_gradient(model, all_losses(model)["continuous improvement"])
+
+
+@BOTH
+def test_each_step_moves_its_own_networks_only(algorithm_class):
+    """Q1 is called for the critics' loss, then for the discrete and for the continuous policy's: steps lie in between."""
+    delay = {} if algorithm_class is PaperCHDP else dict(policy_delay=1)
+    model = filled_model(algorithm_class=algorithm_class, **delay)
+    states = []
+
+    def snapshot(*_):
+        states.append({name: [p.detach().clone() for p in params] for name, params in networks(model).items()})
+
+    model.critic.q_networks[0].register_forward_pre_hook(snapshot)
+    model.train(1, 32)
+    snapshot()
+    moved = [
+        {name for name in after if any((p != q).any() for p, q in zip(after[name], before[name], strict=True))}
+        for before, after in itertools.pairwise(states)
+    ]
+    critics_train = {"critic", "codebook"} if algorithm_class is CHDP else {"critic"}
+    assert moved == [critics_train, {"discrete"}, {"continuous", "codebook"}]
+
+
+@BOTH
+def test_continuous_step_sees_the_updated_discrete_policy(algorithm_class):
+    """The latents of step 2 are those that the discrete policy draws after its own step."""
+    delay = {} if algorithm_class is PaperCHDP else dict(policy_delay=1)
+    model = filled_model(algorithm_class=algorithm_class, **delay)
+    predictor = model.actor.discrete_policy.noise_predictor
+    weights = []
+    predictor.register_forward_pre_hook(lambda *_: weights.append(predictor.first_layer.weight.detach().clone()))
+    model.train(1, 32)
+    n = model.n_diffusion_steps
+    # Its diffusion loss and a chain in step 1, a chain in step 2
+    assert len(weights) == 1 + 2 * n
+    assert all(th.equal(w, weights[0]) for w in weights[: 1 + n])
+    assert not th.equal(weights[1 + n], weights[0])
+
+
+@pytest.mark.parametrize("parameters", ["drawn", "stored"])
+def test_parameters_with_which_latents_are_valued(parameters):
+    model = filled_model()
+    data, actor = sample(model), model.actor
+    features = model.critic.features(data.observations)
+    stored = data.parameters if parameters == "stored" else None
+    calls = calls_of(model.critic.q_networks[0])
+    th.manual_seed(0)
+    losses.discrete_policy_loss(model.policy, data, features, stored)
+    th.manual_seed(0)
+    actor.discrete_policy.diffusion_loss(data.latents, features)
+    latents, k = actor.sample_latents(features)
+    expected = data.parameters if parameters == "stored" else actor.sample_parameters(features, k)
+    ((_, seen_latents, seen_parameters),) = calls
+    th.testing.assert_close(seen_latents, latents.detach())
+    th.testing.assert_close(seen_parameters, expected.detach())
+
+
+@BOTH
+def test_target_values(algorithm_class):
+    """y = r + gamma (1 - d) min Q' of the next action that is selected; n-step discounts take the place of gamma."""
+    model = filled_model(algorithm_class=algorithm_class, gamma=0.9)
+    policy, critic = model.policy, model.critic_target
+    data = sample(model)._replace(dones=(th.arange(32)[:, None] % 2).float())
+    features = critic.features(data.next_observations)
+
+    def expected(discounts):
+        th.manual_seed(0)
+        with th.no_grad():
+            latents, _, parameters, _ = policy.select_target(policy.actor_target, critic, features)
+            next_values = policy.value_scale.values(th.min(*critic.q_values(features, latents, parameters)))
+        return data.rewards + discounts * (1 - data.dones) * next_values
+
+    for discounts in (0.9, th.full((32, 1), 0.1)):
+        th.manual_seed(0)
+        targets = losses.target_values(policy, data._replace(discounts=discounts))
+        th.testing.assert_close(targets, expected(discounts))
+        assert targets.shape == (32, 1) and not targets.requires_grad
+        assert (targets[1::2] == data.rewards[1::2]).all() and (targets[::2] != data.rewards[::2]).any()
+
+
+def test_critic_loss():
+    """The sum of both squared errors, weighted; the larger error is the one that priorities follow."""
+    model = filled_model()
+    data, targets = sample(model), th.randn(32, 1)
+    features = model.critic.features(data.observations)
+    q1, q2 = model.critic.q_values(features, data.latents, data.parameters)
+    loss, q_values, errors = losses.critic_loss(model.policy, data._replace(weights=1.0), features, targets)
+    th.testing.assert_close(loss, F.mse_loss(q1, targets) + F.mse_loss(q2, targets))
+    th.testing.assert_close(q_values, q1.detach())
+    th.testing.assert_close(errors, th.cat([q1 - targets, q2 - targets], dim=1).abs().amax(dim=1).detach())
+    one = th.zeros(32, 1)
+    one[3] = 1.0
+    weighted, *_ = losses.critic_loss(model.policy, data._replace(weights=one), features, targets)
+    th.testing.assert_close(weighted, ((q1[3] - targets[3]) ** 2 + (q2[3] - targets[3]) ** 2).squeeze() / 32)
+
+
+def test_alpha_normalises_by_q():
+    """The discrete loss is L_d - eta / mean|Q| * mean Q: however large the values of the critic are."""
+    model = filled_model(learning_rate=0.0, policy_delay=1)
+    for critic in (model.critic, model.critic_target):
+        critic.rescale(1000)
+    model.train(1, 64)
+    logged = model.logger.name_to_value
+    improvement = logged["train/discrete_loss"] - logged["train/diffusion_loss_discrete"]
+    assert 0 < abs(improvement) < 2 * model.eta
+
+
+def test_relabelling_of_latents():
+    model = filled_model()
+    codebook, data = model.actor.codebook, sample(model, 64)
+    assert (codebook.quantize(data.latents) == data.discrete_actions).all(), "random actions decode to themselves"
+    with th.no_grad():
+        codebook.codewords.neg_()
+    relabelled, drift = losses.relabel_latents(model.policy, data)
+    fits = codebook.quantize(data.latents) == data.discrete_actions
+    assert drift == pytest.approx((~fits).float().mean()) and 0 < drift <= 1
+    assert (codebook.quantize(relabelled.latents) == data.discrete_actions).all()
+    assert (relabelled.latents[fits] == data.latents[fits]).all()
+    assert (relabelled.latents[~fits] == codebook.codewords[data.discrete_actions[~fits]]).all()

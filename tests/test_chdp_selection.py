@@ -1,0 +1,199 @@
+"""Which of several actions CHDP takes."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from sb3_chdp.chdp.candidates import Selection
+from sb3_chdp.common.utils import hash_observations
+from tests.algorithms import calls_of, filled_model
+from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, make_layout_env
+
+N_ACTIONS = 3
+KINDS = {
+    "drawn": Selection(n_drawn=4),
+    "uniform": Selection(n_drawn=2, n_uniform=N_ACTIONS),
+    "random": Selection(n_drawn=1, n_random=8),
+    "all": Selection(n_drawn=2, n_uniform=2, n_random=5),
+    "refined": Selection(n_drawn=2, n_refined=6),
+}
+SELECTIONS = pytest.mark.parametrize("select", KINDS.values(), ids=KINDS)
+
+
+class Critic:
+    """Two value functions of the actions, which notes the candidates that it is asked about."""
+
+    def __init__(self, q1, q2=None):
+        self.q1, self.q2, self.asked = q1, q2 or q1, []
+
+    def q_values(self, features, latents, parameters):
+        assert len(features) == len(latents) == len(parameters)
+        q1, q2 = self.q1(features, latents, parameters), self.q2(features, latents, parameters)
+        self.asked.append((features, latents, parameters, th.min(q1, q2)))
+        return q1, q2
+
+
+def near(value):
+    """Worth more the nearer the first parameter is."""
+    return lambda features, latents, parameters: -(parameters[:, :1] - value).abs()
+
+
+def fixed_noise(actor, batch_size, select):
+    """Noise of all chains that a selection draws."""
+    n_latents, n_parameters = batch_size * select.n_drawn, batch_size * (select.n_drawn + select.n_uniform)
+    latents, parameters = actor.discrete_policy, actor.continuous_policy
+    return (
+        th.randn(latents.n_steps, n_latents, latents.dim),
+        th.randn(parameters.n_steps, n_parameters, parameters.dim),
+    )
+
+
+@pytest.fixture(scope="module")
+def actor():
+    return filled_model().actor.requires_grad_(False)
+
+
+def random_features(actor, n):
+    # Both policies see them, the continuous one more besides
+    return th.randn(n, actor.discrete_policy.noise_predictor.widths[-1])
+
+
+@SELECTIONS
+def test_the_best_of_all_candidates_is_taken(actor, select):
+    """The best by the smaller of both values, for each observation among its own candidates."""
+    features = random_features(actor, 5)
+    critic = Critic(
+        lambda features, latents, parameters: features[:, :1] * parameters + latents[:, :1],
+        lambda features, latents, parameters: features[:, 1:2] * parameters.square() - latents[:, 1:2],
+    )
+    latents, k, parameters, q_values = select(actor, critic, features)
+    assert latents.shape == (5, 4) and k.shape == (5,) and parameters.shape == (5, 1) and q_values.shape == (5, 1)
+    assert (actor.codebook.quantize(latents) == k).all()
+    # Later rounds refine what was best in the first, which competes again
+    first, last = critic.asked[0], critic.asked[-1]
+    n = select.n_drawn + select.n_uniform + select.n_random
+    assert len(first[0]) == 5 * n and (first[0].view(5, n, -1) == features[:, None]).all()
+    best = last[3].view(5, -1).max(dim=1, keepdim=True)
+    assert th.equal(q_values, best.values)
+    for chosen, asked in ((latents, last[1]), (parameters, last[2])):
+        assert th.equal(chosen, asked.view(5, -1, asked.shape[1])[th.arange(5), best.indices[:, 0]])
+    assert (q_values >= first[3].view(5, n).max(dim=1, keepdim=True).values).all()
+
+
+@SELECTIONS
+def test_with_given_noise_the_choice_repeats(actor, select):
+    features, critic = random_features(actor, 5), Critic(near(0.3))
+    noise = fixed_noise(actor, 5, select)
+    first, second, other = (select(actor, critic, features, n) for n in (noise, noise, fixed_noise(actor, 5, select)))
+    assert all(th.equal(a, b) for a, b in zip(first, second, strict=True))
+    assert (first.parameters != other.parameters).any() or select.n_random > 0
+    free = [select(actor, critic, features).parameters for _ in range(2)]
+    assert (free[0] != free[1]).any()
+
+
+def test_every_discrete_action_competes_where_there_are_few(actor):
+    """With what the continuous policy draws for it, so that one that the critics prefer gets tried."""
+    codewords = actor.codebook.codewords
+    for wanted in range(N_ACTIONS):
+        critic = Critic(lambda _, latents, parameters, c=codewords[wanted]: -(latents - c).norm(dim=1, keepdim=True))
+        assert (Selection(1, N_ACTIONS)(actor, critic, random_features(actor, 50)).discrete_actions == wanted).all()
+
+
+def test_fewer_uniform_actions_than_there_are(actor):
+    """Each observation gets some at random, all of them equally often."""
+    critic = Critic(near(0.0))
+    Selection(1, 2)(actor, critic, random_features(actor, 600))
+    k = actor.codebook.quantize(critic.asked[0][1]).view(600, 3)[:, :2]
+    assert (k[:, 0] != k[:, 1]).all()
+    assert (th.bincount(k.flatten(), minlength=N_ACTIONS) / 1200).numpy() == pytest.approx(1 / N_ACTIONS, abs=0.05)
+
+
+def test_random_candidates_find_what_the_policies_miss():
+    """With policies that never draw what the critics value."""
+    model = filled_model()
+    with th.no_grad():
+        for parameter in model.actor.continuous_policy.parameters():
+            parameter.zero_()
+    features = random_features(model.actor, 50)
+    errors = [
+        (select(model.actor, Critic(near(0.7)), features).parameters - 0.7).abs().mean()
+        for select in (Selection(1), Selection(1, n_random=64))
+    ]
+    assert errors[1] < 0.1 < errors[0]
+
+
+def test_refinement():
+    """Variations of the best action come nearer to the best parameters; the discrete action and padding stay."""
+    parameters = spaces.Tuple((box(-1, 1, 1), box(-1, 1, 2)))
+    model = filled_model(LayoutEnv(spaces.Tuple((spaces.Discrete(2), parameters))))
+    actor, mask = model.actor, th.as_tensor(np.array(model.hybrid_space.spec.mask)).bool()
+    assert not mask.all()
+    features = random_features(actor, 50)
+    noise, critic = fixed_noise(actor, 50, Selection(1)), Critic(near(0.7))
+    plain = Selection(1)(actor, critic, features, noise)
+    refined = Selection(1, n_refined=32)(actor, critic, features, noise)
+    assert th.equal(plain.discrete_actions, refined.discrete_actions) and th.equal(plain.latents, refined.latents)
+    assert not refined.parameters[~mask[refined.discrete_actions]].any() and refined.parameters.abs().max() <= 1
+    gain = (plain.parameters[:, 0] - 0.7).abs() - (refined.parameters[:, 0] - 0.7).abs()
+    assert (gain >= 0).all() and gain.mean() > 0.1
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_predictions_are_the_best_candidates(deterministic):
+    """The rows that predict returns are those among all that it asks the target critics about which have the highest Q."""
+    model = filled_model(n_action_candidates=8)
+    obs = np.random.uniform(-1, 1, (6, 4)).astype(np.float32)
+    columns, q_networks = model.hybrid_space.columns, model.critic_target.q_networks
+    calls, outputs = calls_of(q_networks[0]), [[], []]
+    for network, values in zip(q_networks, outputs, strict=True):
+        network.register_forward_hook(lambda module, args, q, values=values: values.append(q.detach()))
+    rows = model.policy.predict_rows(obs, deterministic)
+    # In the last round the best of all before competes again
+    best = th.min(outputs[0][-1], outputs[1][-1]).view(6, -1).argmax(dim=1)
+    for name, asked in zip(("latents", "parameters"), calls[-1][1:], strict=True):
+        expected = asked.view(6, -1, asked.shape[1])[th.arange(6), best]
+        np.testing.assert_array_equal(columns.view(rows, name), expected)
+    latents = th.as_tensor(columns.view(rows, "latents"))
+    assert (model.actor.codebook.quantize(latents).numpy() == columns.discrete_actions(rows)).all()
+    assert len(calls[0][0]) >= 6 * (model.n_action_candidates + N_ACTIONS)
+
+
+def test_more_candidates_for_deterministic_predictions_are_drawn_by_the_target_policies():
+    """They do not waver as the policies do; rollouts follow these."""
+    model = filled_model()
+    obs = np.random.uniform(-1, 1, (6, 4)).astype(np.float32)
+    for deterministic in (False, True):
+        counts = [calls_of(actor.discrete_policy.noise_predictor) for actor in (model.actor, model.actor_target)]
+        model.policy.predict_rows(obs, deterministic)
+        assert [len(calls) > 0 for calls in counts] == [not deterministic, deterministic]
+
+
+def test_deterministic_predictions_repeat():
+    model = filled_model()
+    obs = np.random.uniform(-1, 1, (5, 4)).astype(np.float32)
+    first = model.policy.predict_rows(obs, deterministic=True)
+    np.testing.assert_array_equal(model.policy.predict_rows(obs, deterministic=True), first)
+    # The same for an observation on its own as among others
+    for one, row in zip(obs, first, strict=True):
+        np.testing.assert_allclose(model.policy.predict_rows(one, deterministic=True), row, atol=1e-5)
+    assert (model.policy.predict_rows(obs) != first).any()
+
+
+@pytest.mark.parametrize("env", [HybridIdentityEnv(), make_layout_env("nested")], ids=["equal", "padding"])
+def test_predictions_are_valid(env):
+    model = filled_model(env)
+    obs = np.stack([env.observation_space.sample() for _ in range(50)])
+    for deterministic in (False, True):
+        assert all(env.action_space.contains(action) for action in model.predict(obs, deterministic=deterministic)[0])
+
+
+def test_noise_of_deterministic_predictions_depends_on_the_observation():
+    vectors, images = th.rand(1000, 4), th.randint(256, (1000, 1, 6, 6), dtype=th.uint8)
+    for observations in (vectors, images, {"v": vectors, "i": images}):
+        hashes = hash_observations(observations)
+        assert hashes.shape == (1000,) and len((hashes % 1024).unique()) > 550  # 637 of 1024 expected
+        if isinstance(observations, th.Tensor):
+            assert (hash_observations(observations[5:7]) == hashes[5:7]).all()
+    # A small change is enough
+    assert (hash_observations(vectors + 1e-6) != hash_observations(vectors)).float().mean() > 0.99

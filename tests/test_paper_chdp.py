@@ -1,0 +1,116 @@
+"""PaperCHDP: what the published algorithm does otherwise."""
+
+import inspect
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+
+from sb3_chdp import CHDP
+from sb3_chdp.chdp import PaperCHDP
+from tests.algorithms import calls_of, fast_model, filled_model, sample
+from tests.hybrid_envs import HybridIdentityEnv, make_layout_env
+
+
+@pytest.fixture
+def model():
+    return filled_model(algorithm_class=PaperCHDP)
+
+
+def test_stored_latents_stay(model):
+    """Though the codebook has moved, critics learn about the latents as they were."""
+    with th.no_grad():
+        model.actor.codebook.codewords.neg_()
+    calls = calls_of(model.critic.q_networks[0])
+    model.train(1, 32)
+    stored = th.as_tensor(model.hybrid_space.columns.view(model.replay_buffer.actions[:60, 0], "latents"))
+    assert (calls[0][1][:, None] == stored).all(dim=2).any(dim=1).all()
+    assert 0 < model.logger.name_to_value["train/latent_drift"] <= 1
+
+
+def test_latents_are_valued_with_the_stored_parameters(model):
+    calls = calls_of(model.critic.q_networks[0])
+    model.train(1, 32)
+    critics, discrete, _ = calls
+    assert th.equal(discrete[2], critics[2]) and (discrete[1] != critics[1]).any(dim=1).all()
+
+
+def test_what_the_discrete_policy_draws_is_improved(model):
+    """No uniformly random action, no stored one: two draws of the policy, before and after its step."""
+    codewords = model.actor.codebook.codewords.detach().clone()
+    calls = calls_of(model.critic.q_networks[0])
+    model.train(1, 400)
+    critics, discrete, continuous = (latents for _, latents, _ in calls)
+    for other in (critics, discrete):
+        assert (continuous != other).any(dim=1).float().mean() > 0.95
+    assert not (continuous[:, None] == codewords).all(dim=2).any()
+
+
+def test_critics_leave_the_codebook_alone():
+    model = filled_model(algorithm_class=PaperCHDP)
+    codewords, states = model.actor.codebook.codewords, []
+    model.critic.q_networks[0].register_forward_pre_hook(lambda *_: states.append(codewords.detach().clone()))
+    model.train(1, 32)
+    assert all(th.equal(state, states[0]) for state in states) and not th.equal(codewords, states[0])
+
+
+def test_it_explores_in_the_warm_up_alone(model):
+    """Then one draw of its policies acts, whatever the critics say of it."""
+    columns = model.hybrid_space.columns
+    assert len(np.unique(columns.discrete_actions(model.replay_buffer.actions[:60, 0]))) == 3
+    model.learning_starts, model.gradient_steps = 60, 0
+    calls = calls_of(model.critic_target.q_networks[0])
+    model.learn(100, reset_num_timesteps=False, log_interval=10**6)
+    assert model.logger.name_to_value["rollout/exploration_rate"] == 0
+    acted = model.replay_buffer.actions[60:160, 0]
+    assert len(calls) == 100 and all(len(latents) == 1 for _, latents, _ in calls), "one draw each"
+    for name, i in (("latents", 1), ("parameters", 2)):
+        np.testing.assert_array_equal(columns.view(acted, name), th.cat([call[i] for call in calls]))
+    latents = th.as_tensor(columns.view(acted, "latents"))
+    np.testing.assert_array_equal(model.actor.codebook.quantize(latents), columns.discrete_actions(acted))
+
+
+def test_observations_are_as_they_are(model):
+    data = sample(model)
+    assert th.equal(model.critic.features(data.observations), data.observations)
+    model.train(5, 32)
+    assert th.equal(model.critic.features(data.observations), data.observations)
+
+
+def test_replay_is_uniform():
+    env = make_layout_env(observation_space=spaces.Dict(vector=spaces.Box(-1, 1, (2,))))
+    assert type(fast_model(PaperCHDP).replay_buffer) is ReplayBuffer
+    assert type(PaperCHDP("MultiInputPolicy", env, buffer_size=100).replay_buffer) is DictReplayBuffer
+
+
+def test_policies_are_updated_every_time_at_a_constant_rate():
+    model = filled_model(algorithm_class=PaperCHDP)
+    model.train(1, 32)
+    assert "train/continuous_loss" in model.logger.name_to_value
+    model = PaperCHDP("MlpPolicy", HybridIdentityEnv(), learning_starts=0, seed=0, n_diffusion_steps=2)
+    rate = model.critic.optimizer.param_groups[0]["lr"]
+    model.learn(20)
+    assert model.critic.optimizer.param_groups[0]["lr"] == rate
+
+
+def test_gradients_are_bounded():
+    """With rewards of any size; Adam, which would hide it, is not used."""
+    steps = {}
+    for algorithm_class in (PaperCHDP, CHDP):
+        policy_kwargs = dict(net_arch=[16], optimizer_class=th.optim.SGD)
+        model = filled_model(algorithm_class=algorithm_class, policy_kwargs=policy_kwargs)
+        model.replay_buffer.rewards[:] *= 1e4
+        model.replay_buffer.rewards[:] += 1e4
+        before = [p.detach().clone() for p in model.critic.parameters()]
+        model.train(1, 32)
+        changes = [p.detach() - q for p, q in zip(model.critic.parameters(), before, strict=True)]
+        steps[algorithm_class] = th.cat([change.flatten() for change in changes]).norm().item() / 1e-3
+    assert steps[PaperCHDP] == pytest.approx(1, abs=0.01)
+    assert steps[CHDP] != pytest.approx(1, abs=0.01)
+
+
+def test_arguments_are_a_part_of_chdps():
+    arguments, of_chdp = (inspect.signature(algorithm).parameters for algorithm in (PaperCHDP, CHDP))
+    assert [name for name in of_chdp if name in arguments] == list(arguments)

@@ -1,0 +1,143 @@
+"""The units of the critics' values."""
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_chdp import CHDP
+from sb3_chdp.chdp import PaperCHDP
+from sb3_chdp.chdp.value_scale import ValueScale
+from tests.algorithms import filled_model, sample
+from tests.hybrid_envs import HybridIdentityEnv
+
+REWARDS = np.random.default_rng(0).normal(2.0, 3.0, 5000)
+
+
+def counted(rewards=REWARDS, termination=0.0, gamma=0.9, n_envs=5):
+    value_scale = ValueScale()
+    ends = np.random.default_rng(1).random(len(rewards)) < termination
+    for i in range(0, len(rewards), n_envs):
+        value_scale.count_transitions(rewards[i : i + n_envs], ends[i : i + n_envs], gamma)
+    return value_scale
+
+
+@pytest.mark.parametrize("gamma, termination", [(0.0, 0.0), (0.9, 0.0), (0.9, 0.2), (1.0, 0.2), (0.9, 1.0)])
+def test_center_is_the_value_of_mean_rewards(gamma, termination):
+    center = counted(gamma=gamma, termination=termination).center.item()
+    assert center == pytest.approx(REWARDS.mean() / (1 - gamma * (1 - termination)), rel=0.05)
+
+
+def test_center_without_end_or_discount_is_finite():
+    value_scale = counted(gamma=1.0)
+    assert th.isfinite(value_scale.center)
+    value_scale.count_targets(value_scale.center.float() + 100 * th.randn(64, 1))
+    th.testing.assert_close(value_scale.outputs(value_scale.values(th.ones(3, 1))), th.ones(3, 1), rtol=0.01, atol=0.01)
+
+
+@pytest.mark.parametrize("spread", [1e-3, 1.0, 1e4])
+def test_scale_is_the_distance_of_targets_from_the_center(spread):
+    value_scale, generator = counted(spread * REWARDS), th.Generator().manual_seed(0)
+    targets = value_scale.center.float() + spread * 7 * th.randn(600, 64, 1, generator=generator)
+    for batch in targets:
+        value_scale.count_targets(batch)
+    assert value_scale.scale.item() == pytest.approx(7 * spread, rel=0.05)
+    outputs = value_scale.outputs(targets)
+    assert outputs.std().item() == pytest.approx(1, abs=0.05) and outputs.mean().abs() < 0.05
+    th.testing.assert_close(value_scale.values(outputs), targets, rtol=1e-4, atol=1e-4 * spread)
+
+
+@pytest.mark.parametrize("n_envs", [1, 10])
+def test_center_follows_rewards_that_change(n_envs):
+    """However many environments there are: a transition counts as much."""
+    value_scale = counted(np.repeat([1.0, 2.0], [5_000, 30_000]), gamma=0.0, n_envs=n_envs)
+    assert value_scale.center.item() == pytest.approx(1.95, abs=0.04)
+
+
+@pytest.mark.parametrize("target", [False, True])
+def test_values_stay_when_the_scale_changes(target):
+    model = filled_model(HybridIdentityEnv())
+    policy, data = model.policy, sample(model)
+    critic = model.critic_target if target else model.critic
+    policy.rescale_values(th.randn(32, 1))
+
+    def values():
+        features = critic.features(data.observations)
+        return th.cat(critic.q_values(features, data.latents, data.parameters), dim=1), policy.value_scale.scale.item()
+
+    policy.set_training_mode(False)
+    for factor in (100.0, 0.01):
+        outputs, scale = values()
+        expected = policy.value_scale.values(outputs)
+        for _ in range(20):
+            policy.rescale_values(factor * th.randn(32, 1))
+        outputs, new_scale = values()
+        assert abs(np.log(new_scale / scale)) > 0.1
+        th.testing.assert_close(policy.value_scale.values(outputs), expected, rtol=1e-4, atol=1e-4)
+
+
+class Units(HybridIdentityEnv):
+    """Rewards in other units; episodes go on if they do not end by success."""
+
+    def __init__(self, unit=1.0, offset=0.0, ends=True):
+        super().__init__()
+        self.unit, self.offset, self.ends = unit, offset, ends
+
+    def step(self, action):
+        obs, reward, terminated, *end = super().step(action)
+        return obs, self.unit * (reward + self.offset), terminated and (self.ends or reward > 0), *end
+
+
+def trained(unit, algorithm_class=CHDP, n_updates=30, **kwargs):
+    model = filled_model(Units(unit, ends=False), algorithm_class, n_transitions=200, gamma=0.9, **kwargs)
+    th.manual_seed(0)
+    np.random.seed(0)
+    model.train(n_updates, 32)
+    model.policy.set_training_mode(False)
+    return model
+
+
+@pytest.mark.parametrize("policy_delay", [1, 2])
+@pytest.mark.parametrize("unit", [1e-3, 1e4])
+def test_units_of_rewards_do_not_matter(unit, policy_delay):
+    """The same networks, the same actions, and values in the units of the rewards."""
+    models = [trained(unit, policy_delay=policy_delay) for unit in (1.0, unit)]
+    obs = np.stack([Units().reset(seed=i)[0] for i in range(40)])
+    outputs, actions, q_means = [], [], []
+    for model in models:
+        data = sample_of(model)
+        features = model.critic.features(data.observations)
+        outputs.append(th.cat(model.critic.q_values(features, data.latents, data.parameters), dim=1).detach().numpy())
+        actions.append(model.policy.predict_rows(obs, deterministic=True))
+        q_means.append(model.logger.name_to_value["train/q_mean"])
+    np.testing.assert_allclose(outputs[1], outputs[0], atol=0.02)
+    assert q_means[1] / unit == pytest.approx(q_means[0], abs=0.01)
+    assert (actions[0][:, 0] == actions[1][:, 0]).mean() > 0.9
+    assert np.median(np.abs(actions[0] - actions[1])) < 0.02
+
+
+def sample_of(model):
+    np.random.seed(1)
+    return sample(model)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e4])
+def test_logged_values_are_in_the_units_of_the_rewards(unit):
+    model = filled_model(Units(unit, offset=5.0), n_transitions=200)
+    model.train(300, 32)
+    mean_reward = model.replay_buffer.rewards[:200].mean()
+    # Episodes of one step: the reward is the return
+    assert model.logger.name_to_value["train/q_mean"] == pytest.approx(mean_reward, rel=0.1)
+
+
+def test_the_paper_has_the_units_of_the_rewards():
+    model = trained(1e3, PaperCHDP)
+    outputs = th.randn(5, 1)
+    assert th.equal(model.policy.value_scale.values(outputs), outputs)
+
+
+def test_saved_with_the_model(tmp_path):
+    model = trained(1e3)
+    model.save(tmp_path / "model")
+    loaded = type(model).load(tmp_path / "model").policy.value_scale
+    outputs = th.randn(5, 1)
+    assert th.equal(loaded.values(outputs), model.policy.value_scale.values(outputs))
