@@ -26,8 +26,6 @@ from sb3_chdp.common.utils import TargetUpdate, gradient_step
 
 # By default
 LEARNING_RATE = LinearSchedule(1e-3, 0.0, 1.0)
-# Transitions from which the critics' first units are estimated
-WARM_UP_SAMPLES = 4096
 
 
 class CHDP(HybridOffPolicyAlgorithm):
@@ -108,9 +106,8 @@ class CHDP(HybridOffPolicyAlgorithm):
     uniform_fraction: ClassVar[float] = 0.5
     # Whether the critics' loss trains the codebook
     critics_train_codebook: ClassVar[bool] = True
-    # Whether the critics work in units of their own, see ValueScale
-    scales_values: ClassVar[bool] = True
-    filters: ClassVar[bool] = True
+    # Whether the policies imitate only those replayed actions that the critics value no less than the policies' own
+    filters_actions: ClassVar[bool] = True
     # Bound on the gradient norm of every network
     max_grad_norm: ClassVar[float | None] = None
 
@@ -142,7 +139,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         eta: float = 10.0,
         codebook_lr_factor: float = 1.0,
         n_action_candidates: int = 8,
-        policy_delay: int = 2,
+        policy_delay: int = 1,
         action_layout: str = "auto",
         use_masking: bool | None = None,
         stats_window_size: int = 100,
@@ -223,29 +220,22 @@ class CHDP(HybridOffPolicyAlgorithm):
         if self.critics_train_codebook:
             critic_optimizers.append(policy.codebook_optimizer)
 
-        if self.scales_values and self._n_updates == 0:
-            warm_up = self._sample_batch(WARM_UP_SAMPLES)
-            policy.value_scale.start(warm_up.rewards, (1 - warm_up.dones) * warm_up.discounts)
-
         logs: dict[str, list[th.Tensor]] = {}
         for _ in range(gradient_steps):
             self._n_updates += 1
             replay_data, drift = self._latents_of_today(self._sample_batch(batch_size))
 
             # Step 0: critics, eq. 10 and 11, and the codebook if they train it
-            targets = target_values(policy, replay_data)
-            if self.scales_values:
-                policy.rescale_values(targets)
+            targets = policy.in_units_of_critics(target_values(policy, replay_data))
             features = policy.critic.features(replay_data.observations)
             self.update_targets.copy_statistics()
-            loss, q_values, errors = critic_loss(policy, replay_data, features, policy.value_scale.outputs(targets))
+            loss, q_values, errors = critic_loss(policy, replay_data, features, targets)
             gradient_step(loss, critic_optimizers, self.max_grad_norm, "critic_loss")
             policy.actor.codebook.project()
             if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
                 assert replay_data.indices is not None, "a prioritised buffer says where its samples are"
                 self.replay_buffer.update_priorities(replay_data.indices, errors)
-            q_mean = policy.value_scale.values(q_values).mean()
-            losses = {"critic_loss": loss, "q_mean": q_mean, "latent_drift": drift}
+            losses = {"critic_loss": loss, "q_mean": policy.value_scale.values(q_values).mean(), "latent_drift": drift}
 
             if self._n_updates % self.policy_delay == 0:
                 alpha = self.eta / q_values.abs().mean().clamp(min=1e-6)
@@ -253,18 +243,17 @@ class CHDP(HybridOffPolicyAlgorithm):
 
                 # Step 1: discrete policy, eq. 7
                 parameters = self._parameters_of_latents(replay_data)
-                diffusion_loss, q_loss, weights = discrete_policy_loss(
-                    policy, replay_data, features, parameters, q_values if self.filters else None
-                )
+                rivals = q_values if self.filters_actions else None
+                diffusion_loss, q_loss, counts = discrete_policy_loss(policy, replay_data, features, parameters, rivals)
                 loss = diffusion_loss + alpha * q_loss
                 gradient_step(loss, [policy.discrete_optimizer], self.max_grad_norm, "discrete_loss")
                 losses |= {"discrete_loss": loss, "diffusion_loss_discrete": diffusion_loss}
-                if weights is not None:
-                    losses["imitated"] = weights.mean()
+                if counts is not None:
+                    losses["imitation_rate"] = counts.mean()
 
                 # Step 2: continuous policy and codebook, eq. 8, given the updated discrete policy
                 latents, k = self._actions_to_improve(replay_data, features)
-                diffusion_loss, q_loss = continuous_policy_loss(policy, replay_data, features, latents, k, weights)
+                diffusion_loss, q_loss = continuous_policy_loss(policy, replay_data, features, latents, k, counts)
                 loss = diffusion_loss + alpha * q_loss
                 optimizers = [policy.continuous_optimizer, policy.codebook_optimizer]
                 gradient_step(loss, optimizers, self.max_grad_norm, "continuous_loss")

@@ -11,7 +11,6 @@ from torch import nn
 
 # Chebyshev polynomials of the parameters that the critics see
 PARAMETER_DEGREE = 2
-PRODUCTS = True
 
 
 def chebyshev_features(x: th.Tensor, degree: int) -> th.Tensor:
@@ -59,10 +58,11 @@ class BilinearReads(nn.Module):
 
 class QNetwork(nn.Module):
     """
-    Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a, with layer normalisation, which bounds Q where there
-    is no data (Ball et al., 2023). A sees polynomials of the parameters and bilinear reads of all by the latent.
+    Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a.
 
-    V and A are not told apart further: V learns what does not depend on the action (as in Wang et al., 2016).
+    A sees polynomials of the parameters, bilinear reads of all by the latent, and the products of all entries of the latent
+    with all parameters: what a parameter does depends on the discrete action, often by a factor. V and A are not told apart
+    further: V learns what does not depend on the action (as in Wang et al., 2016).
 
     :param features_dim: number of features of the state
     :param latent_dim: width of the latent
@@ -82,20 +82,18 @@ class QNetwork(nn.Module):
         n_reads: int,
     ):
         super().__init__()
-        normalize: list[type[nn.Module]] = [nn.LayerNorm]
         n_inputs = features_dim + n_parameters * PARAMETER_DEGREE
         self.reads = BilinearReads(n_inputs, latent_dim, n_reads)
         value_arch = [width // 2 for width in net_arch[:1]]
-        self.value = nn.Sequential(*create_mlp(features_dim, 1, value_arch, activation_fn, post_linear_modules=normalize))
-        n_inputs += latent_dim * (1 + n_parameters * PRODUCTS) + n_reads
-        self.advantage = nn.Sequential(*create_mlp(n_inputs, 1, net_arch, activation_fn, post_linear_modules=normalize))
+        self.value = nn.Sequential(*create_mlp(features_dim, 1, value_arch, activation_fn))
+        n_inputs += latent_dim + n_reads + latent_dim * n_parameters
+        self.advantage = nn.Sequential(*create_mlp(n_inputs, 1, net_arch, activation_fn))
 
     def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
         """:return: (B, 1) values"""
         x = th.cat([features, chebyshev_features(parameters, PARAMETER_DEGREE)], dim=1)
-        products = [(latents[:, :, None] * parameters[:, None]).flatten(1)] if PRODUCTS else []
-        advantages = self.advantage(th.cat([x, latents, self.reads(x, latents), *products], dim=1))
-        return self.value(features) + advantages
+        products = (latents[:, :, None] * parameters[:, None]).flatten(1)
+        return self.value(features) + self.advantage(th.cat([x, latents, self.reads(x, latents), products], dim=1))
 
     @th.no_grad()
     def rescale(self, factor: float, summand: float) -> None:

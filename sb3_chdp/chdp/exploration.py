@@ -6,7 +6,7 @@ import torch as th
 from sb3_chdp.chdp.policies import CHDPPolicy
 
 # After so many steps, and some for each discrete action, every second action still explores
-HALF_LIFE, HALF_LIFE_PER_ACTION = 2000, 10
+HALF_LIFE, HALF_LIFE_PER_ACTION = 500, 5
 # Explored actions of an episode that always remain, unless that is more than a share of all
 ACTIONS_PER_EPISODE, MAX_FINAL_RATE = 2.0, 0.3
 # Smallest and largest standard deviation of the noise on scaled parameters

@@ -44,6 +44,8 @@ class PaperPolicy(CHDPPolicy):
     :param kwargs: those of :class:`CHDPPolicy`
     """
 
+    adapts_values: ClassVar[bool] = False
+
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **{"features_extractor_class": FlattenExtractor, **kwargs})
 
@@ -121,7 +123,7 @@ class PaperCHDP(CHDP):
     }
     uniform_fraction: ClassVar[float] = 0.0
     critics_train_codebook: ClassVar[bool] = False
-    scales_values: ClassVar[bool] = False
+    filters_actions: ClassVar[bool] = False
     max_grad_norm: ClassVar[float | None] = 1.0
 
     def __init__(

@@ -1,7 +1,8 @@
 """Networks of CHDP: a discrete and a continuous diffusion policy, their codebook, the twin critic and all targets."""
 
 from copy import deepcopy
-from typing import Any
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -57,6 +58,9 @@ class CHDPPolicy(HybridPolicy):
     :param n_action_candidates: number of actions drawn per observation, that of :class:`CHDP`
     """
 
+    # Whether the units of the critics follow the rewards, see ValueScale
+    adapts_values: ClassVar[bool] = True
+
     fixed_latent_noise: th.Tensor
     fixed_parameter_noise: th.Tensor
 
@@ -102,7 +106,7 @@ class CHDPPolicy(HybridPolicy):
         for target in (self.actor_target, self.critic_target):
             target.requires_grad_(False)
             target.train(False)
-        self.value_scale = ValueScale()
+        self.value_scale = ValueScale(self.adapts_values)
         self.select, self.select_deterministic, self.select_target = self._make_selections(spec.n_discrete_actions)
 
         actor = self.actor
@@ -146,8 +150,9 @@ class CHDPPolicy(HybridPolicy):
 
     def _make_selections(self, n_discrete_actions: int) -> tuple[Selection, Selection, Selection]:
         """:return: rules for acting, for deterministic predictions and for next actions"""
-        competing = (self.n_action_candidates, min(n_discrete_actions, MAX_UNIFORM_CANDIDATES), N_RANDOM_CANDIDATES)
-        return Selection(*competing), Selection(*competing, N_REFINEMENT_CANDIDATES), Selection(n_drawn=1, n_uniform=1)
+        drawn = Selection(self.n_action_candidates, n_uniform=min(n_discrete_actions, MAX_UNIFORM_CANDIDATES))
+        acting = replace(drawn, n_random=N_RANDOM_CANDIDATES)
+        return acting, replace(drawn, n_refined=N_REFINEMENT_CANDIDATES), Selection(n_drawn=1)
 
     def _make_optimizer(self, network: nn.Module, lr_schedule: Schedule) -> th.optim.Optimizer:
         parameters = list(network.parameters())
@@ -207,15 +212,18 @@ class CHDPPolicy(HybridPolicy):
         columns.view(rows, "latents")[:] = latents.cpu().numpy()
         return rows
 
-    def rescale_values(self, targets: th.Tensor) -> None:
+    def in_units_of_critics(self, targets: th.Tensor) -> th.Tensor:
         """
-        Adapt the units of the critics; the values stay what they were.
+        Adapt the units of the critics to new targets; values stay what they were.
 
-        :param targets: (B, 1) targets of the critics, in the units of the rewards
+        :param targets: (B, 1) targets in the units of the rewards
+        :return: (B, 1) what the critics ought to put out
         """
-        factor, summand = self.value_scale.update(targets)
-        for critic in (self.critic, self.critic_target):
-            critic.rescale(factor, summand)
+        if self.value_scale.adapts:
+            factor, summand = self.value_scale.update(targets)
+            for critic in (self.critic, self.critic_target):
+                critic.rescale(factor, summand)
+        return self.value_scale.outputs(targets)
 
     def set_training_mode(self, mode: bool) -> None:
         """

@@ -19,6 +19,8 @@ MAX_WHITENED = 256
 SHRINKAGE = 0.01
 # Largest normalised and whitened values
 MAX_NORMALIZED, MAX_WHITENED_VALUE = 10.0, 5.0
+# Of the whitened values: small differences are of use, but must not drown the rest
+WHITENED_GAIN = 0.3
 # What float32 resolves of a large number, and the least variance
 RESOLUTION, MIN_VARIANCE = 3e-7, 1e-12
 
@@ -101,7 +103,7 @@ class RunningNormalization(nn.Module):
         z = self._standardize(deviations)
         if self.whitens:
             z = (z @ self.running_transform).clamp(-MAX_WHITENED_VALUE, MAX_WHITENED_VALUE)
-        return th.cat([scaled, z], dim=1)
+        return th.cat([scaled, WHITENED_GAIN * z], dim=1)
 
 
 class NormalizedExtractor(FlattenExtractor):
