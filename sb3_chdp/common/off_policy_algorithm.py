@@ -24,6 +24,9 @@ from sb3_chdp.common.rows import MASK_PARTS, pack_bits
 from sb3_chdp.common.safe_zip import refuse
 from sb3_chdp.common.samples import HybridReplaySamples, name_columns
 
+# Bytes of actions in a replay buffer that deserve a warning
+LARGE_ROWS = 2**30
+
 SelfHybridOffPolicyAlgorithm = TypeVar("SelfHybridOffPolicyAlgorithm", bound="HybridOffPolicyAlgorithm")
 
 
@@ -117,6 +120,16 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
                 self.replay_buffer_class = MaskedNStepReplayBuffer
                 self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": self.n_steps, "gamma": self.gamma}
             super()._setup_model()
+        self._warn_of_memory()
+
+    def _warn_of_memory(self) -> None:
+        assert self.replay_buffer is not None
+        n_bytes = self.replay_buffer.actions.nbytes
+        if n_bytes > LARGE_ROWS:
+            warnings.warn(
+                f"The actions in the replay buffer will take {n_bytes / 1e9:.1f} GB: {self.replay_buffer.action_dim} numbers "
+                f"for each of buffer_size={self.buffer_size} transitions"
+            )
 
     def _exploration_schedule(self, initial: float, final: float) -> Schedule:
         """:return: linear schedule that ends after ``exploration_fraction`` of the training"""

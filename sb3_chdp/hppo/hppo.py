@@ -87,6 +87,7 @@ class HPPO(HybridAlgorithm, PPO):
         "MultiInputPolicy": MultiInputPolicy,
     }
     policy: HPPOPolicy
+    takes_factored = True
 
     def __init__(
         self,
