@@ -6,6 +6,7 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib.common.maskable.callbacks import MaskableEvalCallback
 from sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_masked_policy
+from stable_baselines3.common import callbacks
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy as evaluate_free_policy
 
@@ -171,3 +172,15 @@ def test_hppo_learns_faster_from_masks_than_from_a_penalty():
         returns[with_masks] = evaluate_policy(model, env, 200)[0]
     assert returns[True] > 0.9
     assert returns[False] < returns[True] - 0.2
+
+
+def test_rl_zoo3_evaluates_with_masks(monkeypatch):
+    """Its evaluations are those of SB3's callback, which hands no masks to ``predict``."""
+    zoo = pytest.importorskip("sb3_chdp.zoo", exc_type=ImportError)
+    model = make_model(PATD3, make_vec_env(MaskedEnv, 1))
+    callback = callbacks.EvalCallback(make_vec_env(MaskedEnv, 1), n_eval_episodes=5, eval_freq=10, verbose=0)
+    with pytest.raises(ValueError, match="masked"):
+        model.learn(40, callback=callback)
+    monkeypatch.setattr(callbacks, "evaluate_policy", callbacks.evaluate_policy)  # put back after the test
+    zoo.register()
+    model.learn(40, callback=callback)

@@ -5,7 +5,7 @@ import torch as th
 
 from sb3_chdp.chdp.codebook import Codebook
 from sb3_chdp.chdp.product_codebook import ProductCodebook, choice_usage
-from sb3_chdp.common.product_table import block_widths
+from sb3_chdp.common.product_table import block_widths, random_values
 
 RADICES = (3, 2, 5, 1)
 
@@ -56,7 +56,7 @@ def test_a_single_choice_is_the_codebook():
 def test_codewords_decode_to_themselves_and_learn():
     th.manual_seed(0)
     codebook = ProductCodebook(RADICES, 3)
-    k = codebook.random_choices((4, 50))
+    k = random_values(RADICES, (4, 50))
     assert k.shape == (4, 50, 4) and all(set(k[..., i].flatten().tolist()) == set(range(n)) for i, n in enumerate(RADICES))
     latents = codebook.representative_latents(k)
     assert latents.shape == (4, 50, codebook.latent_dim) and not latents.requires_grad
@@ -73,8 +73,21 @@ def test_codewords_decode_to_themselves_and_learn():
 
 
 def test_random_choices_repeat_with_a_generator():
-    first, second = (ProductCodebook((7, 7), 2).random_choices((30,), th.Generator().manual_seed(3)) for _ in range(2))
+    first, second = (random_values((7, 7), (30,), generator=th.Generator().manual_seed(3)) for _ in range(2))
     assert (first == second).all()
+
+
+def test_random_values_are_uniform_over_what_masks_allow():
+    th.manual_seed(0)
+    masks = th.zeros(2, sum(RADICES), dtype=th.bool)
+    masks[0, [0, 2, 4, 5, 7, 8, 10]] = True
+    masks[1] = True
+    k = random_values(RADICES, (2, 3000), masks)
+    for row, allowed in enumerate(([{0, 2}, {1}, {0, 2, 3}, {0}], [set(range(n)) for n in RADICES])):
+        for choice, values in enumerate(allowed):
+            counts = th.bincount(k[row, :, choice], minlength=RADICES[choice])
+            assert set(counts.nonzero().flatten().tolist()) == values
+            assert (counts[list(values)] - 3000 / len(values)).abs().max() < 4 * 3000**0.5
 
 
 def test_usage_is_a_mean_over_the_choices():

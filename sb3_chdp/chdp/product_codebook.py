@@ -36,13 +36,6 @@ class ProductCodebook(ProductTable):
         with th.no_grad():
             self.vectors.clamp_(-1, 1)
 
-    def random_choices(self, shape: tuple[int, ...], generator: th.Generator | None = None) -> th.Tensor:
-        """:return: (*shape, L) uniformly random discrete actions; the generator is on the CPU, None: the global one"""
-        draws = th.rand(*shape, len(self.radices), generator=generator).to(self.vectors.device)
-        radices = th.tensor(self.radices, device=draws.device)
-        # Rounding may lead to the radix itself
-        return (draws * radices).long().minimum(radices - 1)
-
 
 def choice_usage(k: th.Tensor, radices: tuple[int, ...]) -> tuple[float, float]:
     """

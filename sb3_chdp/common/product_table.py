@@ -76,3 +76,27 @@ class ProductTable(nn.Module):
         )
         allowed = self.exists if masks is None else self.exists & masks[:, self.places]
         return distances.masked_fill(~allowed, th.inf).argmin(dim=2)
+
+
+def random_values(
+    radices: tuple[int, ...], shape: tuple[int, ...], masks: th.Tensor | None = None, generator: th.Generator | None = None
+) -> th.Tensor:
+    """
+    :param radices: numbers of values of L choices
+    :param shape: how many actions; its first number is B if there are masks
+    :param masks: (B, sum of the radices) False for values that may not be drawn
+    :param generator: random generator on the CPU, the global one if None
+    :return: (*shape, L) uniformly random values, on the device of the masks
+    """
+    device = "cpu" if masks is None else masks.device
+    draws = th.rand(*shape, len(radices), generator=generator).to(device)
+    if masks is None:
+        counts = th.tensor(radices)
+        # Rounding may lead to the count itself
+        return (draws * counts).long().minimum(counts - 1)
+    table, exists = value_table(radices)
+    allowed = masks[:, th.tensor(table, device=device)] & th.tensor(exists, device=device)
+    allowed = allowed.view(len(masks), *[1] * (len(shape) - 1), *table.shape)
+    counts = allowed.sum(dim=-1)
+    ranks = (draws * counts).long().minimum(counts - 1)
+    return (allowed.cumsum(dim=-1) > ranks[..., None]).byte().argmax(dim=-1)
