@@ -34,7 +34,10 @@ def check_hybrid_env(env: gym.Env, action_layout: str = "auto", warn: bool = Tru
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     n_shown = min(spec.n_discrete_actions, N_STEPS)
-    choices = np.linspace(0, spec.n_discrete_actions - 1, n_shown).astype(int)
+    if spec.is_factored:
+        choices = np.linspace(0, np.array(spec.radices) - 1, n_shown).astype(int)
+    else:
+        choices = np.linspace(0, spec.n_discrete_actions - 1, n_shown).astype(int)
     ends = [np.append(k, np.full(spec.max_parameters, end)) for k in choices for end in (-1.0, 1.0)]
     with_success, n_steps = 0, 0
     for row in [*ends, *spec.sample_rows(rng, N_STEPS)]:

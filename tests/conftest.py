@@ -2,9 +2,12 @@ import multiprocessing
 
 import pytest
 import torch as th
+from hypothesis import settings
 
 from tests.algorithms import ALGORITHMS, OFF_POLICY_ALGORITHMS
 
+# For once: pytest --hypothesis-profile=thorough
+settings.register_profile("thorough", max_examples=10_000)
 # Small networks: more threads are slower, and tests may run side by side
 th.set_num_threads(1)
 # Else every environment of every SubprocVecEnv imports PyTorch anew

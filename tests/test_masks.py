@@ -6,6 +6,8 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib.common.maskable.callbacks import MaskableEvalCallback
 from sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_masked_policy
+from stable_baselines3.common import callbacks
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy as evaluate_free_policy
 
@@ -89,12 +91,15 @@ def test_an_environment_that_allows_nothing(algorithm):
         make_model(algorithm, env).learn(60)
 
 
-@pytest.mark.parametrize("n_steps", [1, 3])
+@pytest.mark.parametrize("n_steps, explicit", [(1, False), (3, False), (3, True)])
 @pytest.mark.parametrize("tells_last", [False, True])
-def test_buffers_hold_the_masks_of_both_states(n_steps, tells_last):
+def test_buffers_hold_the_masks_of_both_states(n_steps, explicit, tells_last):
     """Observations show the masks that belong to them."""
     env = make_vec_env(lambda: MaskedEnv("nested", tells_last), 3, seed=0)
-    model = make_model(PATD3, env, n_steps=n_steps, buffer_size=300).learn(600)
+    kwargs = dict(n_steps=n_steps)
+    if explicit:
+        kwargs = dict(replay_buffer_class=NStepReplayBuffer, replay_buffer_kwargs=dict(n_steps=n_steps, gamma=0.99))
+    model = make_model(PATD3, env, buffer_size=300, **kwargs).learn(600)
     data = model._sample_batch(2000)
     assert (data.masks == data.observations.bool()).all()
     ends_right = (data.next_masks == data.next_observations.bool()).all(dim=1)
@@ -171,3 +176,15 @@ def test_hppo_learns_faster_from_masks_than_from_a_penalty():
         returns[with_masks] = evaluate_policy(model, env, 200)[0]
     assert returns[True] > 0.9
     assert returns[False] < returns[True] - 0.2
+
+
+def test_rl_zoo3_evaluates_with_masks(monkeypatch):
+    """Its evaluations are those of SB3's callback, which hands no masks to ``predict``."""
+    zoo = pytest.importorskip("sb3_chdp.zoo", exc_type=ImportError)
+    model = make_model(PATD3, make_vec_env(MaskedEnv, 1))
+    callback = callbacks.EvalCallback(make_vec_env(MaskedEnv, 1), n_eval_episodes=5, eval_freq=10, verbose=0)
+    with pytest.raises(ValueError, match="masked"):
+        model.learn(40, callback=callback)
+    monkeypatch.setattr(callbacks, "evaluate_policy", callbacks.evaluate_policy)  # put back after the test
+    zoo.register()
+    model.learn(40, callback=callback)

@@ -8,7 +8,7 @@ from sb3_chdp.chdp.policies import CHDPPolicy
 # After so many steps, and some for each discrete action, every second action still explores
 HALF_LIFE, HALF_LIFE_PER_ACTION = 500, 5
 # Explored actions of an episode that always remain, unless that is more than a share of all
-ACTIONS_PER_EPISODE, MAX_FINAL_RATE = 2.0, 0.3
+ACTIONS_PER_EPISODE, MAX_FINAL_RATE = 1.0, 0.1
 # Smallest and largest standard deviation of the noise on scaled parameters
 NOISE_SCALES = (0.03, 1.0)
 

@@ -35,7 +35,7 @@ from sb3_chdp.common.masks import env_masks
 from sb3_chdp.common.native_env import NativeActionVecEnv
 from sb3_chdp.common.resume import last_checkpoint
 from sb3_chdp.common.safe_zip import VERSION, misfit, read_model, save_model
-from sb3_chdp.common.spaces import LAYOUTS
+from sb3_chdp.common.spaces import LAYOUTS, MAX_DISCRETE_ACTIONS
 from sb3_chdp.common.utils import NonFiniteLossError
 
 SelfHybridAlgorithm = TypeVar("SelfHybridAlgorithm", bound="HybridAlgorithm")
@@ -64,6 +64,8 @@ class HybridAlgorithm(BaseAlgorithm):
     }
     action_layout: str
     hybrid_space: HybridBox
+    # Whether rows may have a column for every discrete choice, or only one for the joint index of all
+    takes_factored: ClassVar[bool] = False
     # Whether the environment is asked for the discrete actions that it allows
     use_masking: bool = False
     # An array or a dict of arrays, which SB3's own annotations hand on where one of them is accepted
@@ -130,6 +132,24 @@ class HybridAlgorithm(BaseAlgorithm):
         """:return: the space of the rows that buffer and networks work with"""
         return HybridBox(self.action_space, self.action_layout)
 
+    def _make_rows(self) -> HybridBox:
+        """:return: what :meth:`_make_hybrid_space` makes, with one index for algorithms that need it"""
+        space = self._make_hybrid_space()
+        if self.takes_factored or not space.spec.is_factored:
+            return space
+        n_actions = space.spec.n_discrete_actions
+        if self.action_layout == "factored" or n_actions > MAX_DISCRETE_ACTIONS:
+            raise ValueError(
+                f"{type(self).__name__} needs one index for all of the {n_actions} joint discrete actions, at most "
+                f"{MAX_DISCRETE_ACTIONS} of action_layout='auto' or 'joint': use HPPO, PATD3, HHQNTD3 or HyARTD3, which take "
+                "every discrete part as a choice of its own"
+            )
+        layout, self.action_layout = self.action_layout, "joint"
+        try:
+            return self._make_hybrid_space()
+        finally:
+            self.action_layout = layout
+
     def _network_kwargs(self) -> dict[str, Any]:
         """:return: arguments of the algorithm that shape its networks, handed to the policy beside ``policy_kwargs``"""
         return {}
@@ -138,7 +158,7 @@ class HybridAlgorithm(BaseAlgorithm):
         check_arguments(self)
         check_policy_kwargs(self.policy_class, self.policy_kwargs)
         native_space, policy_kwargs = self.action_space, self.policy_kwargs
-        self.hybrid_space = self._make_hybrid_space()
+        self.hybrid_space = self._make_rows()
         # Buffer and policy are built for the rows; the model keeps the user's space
         self.action_space = self.hybrid_space
         self.policy_kwargs = {**policy_kwargs, **self._network_kwargs()}

@@ -4,9 +4,12 @@ import math
 from copy import copy
 from typing import TypeVar
 
-import numpy as np
 import torch as th
-from sb3_contrib.common.maskable.distributions import MaskableCategoricalDistribution, MaybeMasks
+from sb3_contrib.common.maskable.distributions import (
+    MaskableCategoricalDistribution,
+    MaskableMultiCategoricalDistribution,
+    MaybeMasks,
+)
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from torch import nn
 
@@ -18,7 +21,8 @@ SelfHybridDistribution = TypeVar("SelfHybridDistribution", bound="HybridDistribu
 
 class HybridDistribution(DiagGaussianDistribution):
     """
-    A categorical distribution of k beside a diagonal Gaussian of the P parameters of all actions.
+    A categorical distribution of k, or one of each choice of a factored space, beside a diagonal Gaussian of the P parameters
+    of all actions.
 
     Only the parameters of the chosen action enter the density: the others are not executed. Actions are rows
     ``[k | scaled parameters of all actions | masks]``; the masks are there if the space has the columns.
@@ -31,11 +35,19 @@ class HybridDistribution(DiagGaussianDistribution):
     def __init__(self, action_space: ConcatenatedBox):
         spec = action_space.spec
         super().__init__(spec.n_parameters)
-        self.n_discrete_actions = spec.n_discrete_actions
+        self.n_logits = sum(spec.radices)
+        self.options_of = spec.options_of
         self.columns = action_space.columns
-        self.categorical = MaskableCategoricalDistribution(spec.n_discrete_actions)
+        self.categorical = self._make_categorical()
+        self._masks: MaybeMasks = None
         self._parameter_index = th.tensor(spec.parameter_index)
         self._parameter_mask = th.tensor(spec.mask, dtype=th.float32)
+
+    def _make_categorical(self) -> MaskableCategoricalDistribution | MaskableMultiCategoricalDistribution:
+        radices = self.columns.radices
+        if len(radices) == 1:
+            return MaskableCategoricalDistribution(radices[0])
+        return MaskableMultiCategoricalDistribution(list(radices))
 
     def proba_distribution_net(self, latent_dim: int, log_std_init: float = 0.0) -> tuple[nn.Module, nn.Parameter]:
         """
@@ -44,7 +56,7 @@ class HybridDistribution(DiagGaussianDistribution):
         :return: layer of the K logits and P means, (P,) log standard deviation
         """
         _, log_std = super().proba_distribution_net(latent_dim, log_std_init)
-        return nn.Linear(latent_dim, self.n_discrete_actions + self.action_dim), log_std
+        return nn.Linear(latent_dim, self.n_logits + self.action_dim), log_std
 
     def proba_distribution(
         self: SelfHybridDistribution, mean_actions: th.Tensor, log_std: th.Tensor
@@ -54,20 +66,25 @@ class HybridDistribution(DiagGaussianDistribution):
         :param log_std: (P,) log standard deviation
         :return: the distribution with these parameters
         """
-        logits, means = mean_actions.split([self.n_discrete_actions, self.action_dim], dim=1)
+        logits, means = mean_actions.split([self.n_logits, self.action_dim], dim=1)
         distribution = copy(self)
-        distribution.categorical = MaskableCategoricalDistribution(self.n_discrete_actions)
+        distribution.categorical, distribution._masks = self._make_categorical(), None
         distribution.categorical.proba_distribution(logits)
         return DiagGaussianDistribution.proba_distribution(distribution, means, log_std)
 
     def apply_masking(self, masks: MaybeMasks) -> None:
         """
-        :param masks: (B, K) False for discrete actions that may not be taken; None removes a former mask
+        :param masks: (B, K) False for discrete actions that may not be taken, (B, sum of the radices) of a factored space;
+            None removes a former mask
         :raises ValueError: for another number of masks
         """
-        shape = self.categorical.distribution.logits.shape
-        if masks is not None and math.prod(np.shape(masks)) != math.prod(shape):
-            raise ValueError(f"action_masks must have shape (n, K) = {tuple(shape)}, got {tuple(np.shape(masks))}")
+        shape = (len(self.distribution.mean), self.n_logits)
+        if masks is not None:
+            masks = th.as_tensor(masks, dtype=th.bool, device=self.distribution.mean.device)
+            if masks.numel() != math.prod(shape):
+                raise ValueError(f"action_masks must have shape (n, K) = {shape}, got {tuple(masks.shape)}")
+            masks = masks.view(shape)
+        self._masks = masks
         self.categorical.apply_masking(masks)
 
     def log_prob(self, actions: th.Tensor) -> th.Tensor:
@@ -78,13 +95,14 @@ class HybridDistribution(DiagGaussianDistribution):
         k, parameters = self.columns.discrete_actions(actions), self.columns.view(actions, "parameters")
         if "masks" in self.columns:
             self.apply_masking(self.columns.masks(actions))
-        index = self._parameter_index.to(k.device)[k]
+        options = self.options_of(k)
+        index = self._parameter_index.to(k.device)[options]
         log_densities = self.distribution.log_prob(parameters).gather(1, index)
-        own = self._parameter_mask.to(k.device)[k]
+        own = self._parameter_mask.to(k.device)[options]
         return th.stack([self.categorical.log_prob(k), (log_densities * own).sum(dim=1)], dim=1)
 
     def entropy(self) -> th.Tensor:
-        """:return: (B,) entropy of the categorical distribution; the Gaussian's is not part of HPPO's objective"""
+        """:return: (B,) entropy of the categorical distributions; the Gaussian's is not part of HPPO's objective"""
         return self.categorical.entropy()
 
     def sample(self) -> th.Tensor:
@@ -98,8 +116,6 @@ class HybridDistribution(DiagGaussianDistribution):
     def _rows(self, k: th.Tensor, parameters: th.Tensor) -> th.Tensor:
         parts = {"discrete_actions": k, "parameters": parameters}
         if "masks" in self.columns:
-            masks = self.categorical.distribution.masks
-            if masks is None:
-                masks = th.ones(len(k), self.n_discrete_actions, dtype=th.bool, device=k.device)
-            parts["masks"] = pack_bits(masks)
+            free = th.ones(len(k), self.n_logits, dtype=th.bool, device=k.device)
+            parts["masks"] = pack_bits(free if self._masks is None else th.as_tensor(self._masks))
         return self.columns.pack(**parts)

@@ -28,13 +28,13 @@ class HybridBox(spaces.Box):
         self.spec = HybridActionSpec(native, layout)
         self.latent_dim = latent_dim
         self.mask_parts = tuple(mask_parts)
-        n_masks = self.spec.n_discrete_actions
-        self.columns = RowLayout(n_masks, **self._widths(), **dict.fromkeys(self.mask_parts, -(-n_masks // BITS)))
+        radices = self.spec.radices
+        self.columns = RowLayout(radices, **self._widths(), **dict.fromkeys(self.mask_parts, -(-sum(radices) // BITS)))
         high = np.ones(self.columns.width, dtype=np.float32)
         low = -high
         if "discrete_actions" in self.columns:
             self.columns.view(low, "discrete_actions")[:] = 0
-            self.columns.view(high, "discrete_actions")[:] = self.spec.n_discrete_actions - 1
+            self.columns.view(high, "discrete_actions")[:] = np.array(self.spec.radices) - 1
         for part in self.mask_parts:
             self.columns.view(low, part)[:] = 0
             self.columns.view(high, part)[:] = 2**BITS - 1
@@ -42,7 +42,7 @@ class HybridBox(spaces.Box):
 
     def _widths(self) -> dict[str, int]:
         """:return: columns of a row by name, without masks"""
-        return dict(discrete_actions=1, parameters=self.spec.max_parameters, latents=self.latent_dim)
+        return dict(discrete_actions=len(self.spec.radices), parameters=self.spec.max_parameters, latents=self.latent_dim)
 
     def to_native(self, rows: np.ndarray) -> list[Any]:
         """:return: n native actions of (n, columns) rows"""
@@ -52,7 +52,7 @@ class HybridBox(spaces.Box):
         """
         :param rng: random generator
         :param n: number of rows
-        :param masks: (n, K) False for discrete actions that may not be taken
+        :param masks: (n, sum of the radices) False for values that may not be taken
         :return: (n, columns) rows of uniformly random actions; the latents are for the algorithm to fill in
         """
         rows, columns = self.spec.sample_rows(rng, n, masks), self.spec.columns
@@ -67,7 +67,9 @@ class HybridBox(spaces.Box):
         """Whether x is a row inside the bounds; the index of the discrete action has to be a whole number."""
         if not super().contains(x):
             return False
-        return "scores" in self.columns or bool(self.columns.view(x, "discrete_actions") == self.columns.discrete_actions(x))
+        return "scores" in self.columns or bool(
+            (self.columns.view(x, "discrete_actions") == self.columns.discrete_actions(x)).all()
+        )
 
     def add_noise(self, rows: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """
@@ -77,7 +79,8 @@ class HybridBox(spaces.Box):
         """
         rows = rows.copy()
         parameters = self.columns.view(rows, "parameters")
-        parameters[:] = np.clip(parameters + noise, -1, 1) * self.spec.mask[self.columns.discrete_actions(rows)]
+        options = self.spec.options_of(self.columns.discrete_actions(rows))
+        parameters[:] = np.clip(parameters + noise, -1, 1) * self.spec.mask[options]
         return rows
 
     def __repr__(self) -> str:
@@ -105,7 +108,7 @@ class ConcatenatedBox(HybridBox):
         super().__init__(native, layout, mask_parts=mask_parts)
 
     def _widths(self) -> dict[str, int]:
-        return dict(discrete_actions=1, parameters=self.spec.n_parameters)
+        return dict(discrete_actions=len(self.spec.radices), parameters=self.spec.n_parameters)
 
     def to_native(self, rows: np.ndarray) -> list[Any]:
         choices, parameters = self.columns.discrete_actions(rows), self.columns.view(rows, "parameters")
@@ -124,13 +127,14 @@ class ConcatenatedBox(HybridBox):
 class ScoreBox(ConcatenatedBox):
     """
     The space [-1, 1]^(K + P) of rows ``[scores | scaled parameters of all actions]``, for algorithms whose actor gives a
-    score to every discrete action, of which the highest decides.
+    score to every discrete action, of which the highest decides; in a factored space to every value of every choice, and the
+    highest of each decides.
 
     The arguments are those of :class:`ConcatenatedBox`.
     """
 
     def _widths(self) -> dict[str, int]:
-        return dict(scores=self.spec.n_discrete_actions, parameters=self.spec.n_parameters)
+        return dict(scores=sum(self.spec.radices), parameters=self.spec.n_parameters)
 
     def sample_rows(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
         """:return: (n, columns) uniform scores and parameters; every discrete action is as likely as the others"""
@@ -144,7 +148,7 @@ class ScoreBox(ConcatenatedBox):
     def mask_scores(self, outputs: th.Tensor, masks: th.Tensor) -> th.Tensor:
         """
         :param outputs: (B, K + P) scores and parameters, or rows
-        :param masks: (B, K) False for discrete actions that may not be taken
+        :param masks: (B, number of scores) False for what may not be taken
         :return: the same with the lowest score, -1, for these, and higher ones for all others
         """
         scores = self.columns.view(outputs, "scores")

@@ -6,6 +6,7 @@ import numpy as np
 from sb3_contrib.common.maskable.utils import get_action_masks
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_chdp.common.rows import value_table
 from sb3_chdp.common.spaces import HybridActionSpec
 
 # Where an environment may leave the mask of a state that no one can ask it for any more: the last one of an episode
@@ -17,20 +18,21 @@ def read_masks(spec: HybridActionSpec, masks: Any, n: int) -> np.ndarray:
     :param spec: the action space
     :param masks: (n, M) or (M,) booleans, False for what may not be taken: M is the sum of the numbers of values of all
         discrete parts, whose masks follow each other as for sb3-contrib's ``MaskablePPO``, or the number K of discrete
-        actions; where both are the same number, it is the first
+        actions, if these form one index; where both are the same number, it is the first
     :param n: number of environments
-    :return: (n, K) booleans
+    :return: (n, sum of the radices) booleans for the choices of rows, (n, K) unless the space is factored
     :raises ValueError: for another shape, or if nothing is allowed in an environment; the message names it
     """
     given = np.asarray(masks, dtype=bool)
     array = given.reshape(-1, given.shape[-1]) if given.ndim else given
-    accepted = sorted({spec.n_mask_values, spec.n_discrete_actions})
+    accepted = sorted({spec.n_mask_values, sum(spec.radices)})
     if array.ndim != 2 or len(array) != n or array.shape[1] not in accepted:
         lengths = " or ".join(f"({n}, {m})" for m in accepted)
         raise ValueError(f"action_masks must be booleans of shape {lengths}, got shape {given.shape}")
     if array.shape[1] == spec.n_mask_values:
         array = spec.join_masks(array)
-    stuck = np.flatnonzero(~array.any(axis=1)).tolist()
+    table, exists = value_table(spec.radices)
+    stuck = np.flatnonzero(~(array[:, table] & exists).any(axis=2).all(axis=1)).tolist()
     if stuck:
         raise ValueError(f"action_masks must allow at least one discrete action, got none from environment(s) {stuck}")
     return array

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
@@ -24,6 +24,9 @@ from sb3_chdp.common.policies import HybridPolicy
 from sb3_chdp.common.rows import MASK_PARTS, pack_bits
 from sb3_chdp.common.safe_zip import refuse
 from sb3_chdp.common.samples import HybridReplaySamples, name_columns
+
+# Bytes of actions in a replay buffer that deserve a warning
+LARGE_ROWS = 2**30
 
 SelfHybridOffPolicyAlgorithm = TypeVar("SelfHybridOffPolicyAlgorithm", bound="HybridOffPolicyAlgorithm")
 
@@ -57,8 +60,6 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
     policy: HybridPolicy
     # Standard deviation of Gaussian noise on what the policy puts out; set by algorithms with a deterministic policy
     exploration_noise_schedule: Schedule | None = None
-    # The latest observations and the masks that belong to them
-    _known_masks: tuple[Any, np.ndarray] | None = None
 
     def __init__(
         self,
@@ -130,6 +131,8 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
                     warnings.filterwarnings("ignore", message="`n_steps=")
                     self.replay_buffer_class = MaskedNStepReplayBuffer
                     self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": self.n_steps, "gamma": self.gamma}
+                elif self.use_masking and self.replay_buffer_class is NStepReplayBuffer:
+                    self.replay_buffer_class = MaskedNStepReplayBuffer
                 super()._setup_model()
         except MemoryError as error:
             raise ValueError(
@@ -137,6 +140,16 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
                 "optimize_memory_usage=True halves what observations need"
             ) from error
         self.exploration_schedule = self._exploration_schedule(self.exploration_initial_eps, self.exploration_final_eps)
+        self._warn_of_memory()
+
+    def _warn_of_memory(self) -> None:
+        assert self.replay_buffer is not None
+        n_bytes = self.replay_buffer.actions.nbytes
+        if n_bytes > LARGE_ROWS:
+            warnings.warn(
+                f"The actions in the replay buffer will take {n_bytes / 1e9:.1f} GB: {self.replay_buffer.action_dim} numbers "
+                f"for each of buffer_size={self.buffer_size} transitions"
+            )
 
     def _exploration_schedule(self, initial: float, final: float) -> Schedule:
         """:return: linear schedule that ends after ``exploration_fraction`` of the training"""
@@ -222,7 +235,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         :return: (n_envs, columns) rows, the same for the environment and for the replay buffer
         """
         rng = self.action_space.np_random
-        masks = self._present_masks()
+        masks = self._action_masks()
         rows = self._choose_rows(learning_starts, action_noise, n_envs, rng, masks)
         if masks is not None:
             self.hybrid_space.columns.view(rows, "masks")[:] = pack_bits(masks)
@@ -270,12 +283,6 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         """
         return self.policy.random_rows(rng, len(rows), **({} if masks is None else {"masks": masks}))
 
-    def _present_masks(self) -> np.ndarray | None:
-        """:return: (n_envs, K) masks for the latest observations, None without masking"""
-        if self._known_masks is not None and self._known_masks[0] is self._last_obs:
-            return self._known_masks[1]
-        return self._action_masks()
-
     def _store_transition(
         self,
         replay_buffer: ReplayBuffer,
@@ -300,7 +307,6 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
                 before = columns.masks(buffer_action[i : i + 1])
                 next_masks[i] = (before if given is None else read_masks(self.hybrid_space.spec, given, 1))[0]
             columns.view(buffer_action, "next_masks")[:] = pack_bits(next_masks)
-            self._known_masks = (new_obs, masks)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _draw_noise(self, n_envs: int) -> np.ndarray | None:
@@ -316,9 +322,6 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
     def _mask_parts(self) -> tuple[str, ...]:
         """:return: the masks that rows hold"""
         return MASK_PARTS if self.use_masking else ()
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_known_masks"]
 
     def _sample_batch(self, batch_size: int) -> HybridReplaySamples:
         assert self.replay_buffer is not None

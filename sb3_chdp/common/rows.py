@@ -1,5 +1,6 @@
 """Rows of numbers that stand for actions: the one place that knows which columns hold what."""
 
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -17,16 +18,17 @@ class RowLayout:
     """
     The columns of rows by name, from left to right.
 
-    Names in use: ``discrete_actions`` (1 column, the index k) or ``scores`` (K columns, of which the highest decides),
-    ``parameters`` (scaled to [-1, 1]), ``latents``, ``masks`` and ``next_masks`` (which discrete actions were allowed in the
-    state and in the next one, 16 of them in a column).
+    Names in use: ``discrete_actions`` (a column per choice, with the index of the value) or ``scores`` (a column per value, of
+    which the highest of each choice decides), ``parameters`` (scaled to [-1, 1]), ``latents``, ``masks`` and ``next_masks``
+    (which values were allowed in the state and in the next one, 16 of them in a column).
 
-    :param n_masks: number of booleans in a mask, for the parts that hold masks
+    :param radices: numbers of values of the choices that an action makes
     :param widths: number of columns by name
     """
 
-    def __init__(self, n_masks: int = 0, **widths: int):
-        self.n_masks = n_masks
+    def __init__(self, radices: tuple[int, ...] = (), **widths: int):
+        self.radices = radices
+        self.n_masks = sum(radices)
         ends = np.cumsum([0, *widths.values()]).tolist()
         self._slices = {name: slice(*ends[i : i + 2]) for i, name in enumerate(widths)}
         self.width: int = ends[-1]
@@ -47,18 +49,19 @@ class RowLayout:
     def discrete_actions(self, rows: Array) -> Array:
         """
         :param rows: (n, width) rows
-        :return: (n,) int64 indices of the discrete actions
+        :return: int64 indices of the discrete actions: (n,), or (n, L) if they are made of L > 1 choices
         """
         if "scores" in self:
-            return self.view(rows, "scores").argmax(-1)
-        indices = self.view(rows, "discrete_actions")[..., 0]
+            return best_values(self.view(rows, "scores"), self.radices)
+        indices = self.view(rows, "discrete_actions")
+        indices = indices[..., 0] if indices.shape[-1] == 1 else indices
         return indices.long() if isinstance(indices, th.Tensor) else indices.astype(np.int64)
 
     def masks(self, rows: Array, name: str = "masks") -> Array:
         """
         :param rows: (n, width) rows
         :param name: of the part
-        :return: (n, n_masks) booleans, which discrete actions were allowed
+        :return: (n, n_masks) booleans, which values were allowed
         """
         return unpack_bits(self.view(rows, name), self.n_masks)
 
@@ -76,6 +79,37 @@ class RowLayout:
             assert columns[name].shape == shape, f"{name} must have shape {shape}, got {columns[name].shape}"
         ordered = [columns[name] for name in self._slices]
         return th.cat(ordered, dim=1) if isinstance(first, th.Tensor) else np.concatenate(ordered, axis=1)
+
+
+@lru_cache
+def value_table(radices: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """
+    :param radices: numbers of values of L choices
+    :return: (L, R) where the values of a choice are among all values one after the other, and which of these places exist;
+        R is the largest radix
+    """
+    values = np.arange(max(radices))
+    exists = values < np.array(radices)[:, None]
+    offsets = np.cumsum((0, *radices[:-1]))
+    table = np.where(exists, offsets[:, None] + values, 0)
+    table.setflags(write=False)
+    exists.setflags(write=False)
+    return table, exists
+
+
+def best_values(scores: Array, radices: tuple[int, ...]) -> Array:
+    """
+    :param scores: (..., sum of the radices) scores of all values
+    :param radices: numbers of values of L choices
+    :return: (...) index of the best value for a single choice, else (..., L)
+    """
+    if len(radices) <= 1:
+        return scores.argmax(-1)
+    table, exists = value_table(radices)
+    if isinstance(scores, th.Tensor):
+        in_choices = scores[..., th.tensor(table, device=scores.device)]
+        return in_choices.masked_fill(~th.tensor(exists, device=scores.device), -th.inf).argmax(-1)
+    return np.where(exists, scores[..., table], -np.inf).argmax(-1)
 
 
 def pack_bits(masks: Array) -> Array:

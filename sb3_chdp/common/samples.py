@@ -16,7 +16,8 @@ class HybridReplaySamples(NamedTuple):
     Shapes: actions (B, columns), the rows without masks; of these discrete_actions (B,) int64, parameters (B, Pmax) in
     [-1, 1] with padding 0, or (B, P) those of all actions, latents (B, latent_dim), which may be 0 columns; rewards, dones,
     discounts and weights (B, 1); indices say where a prioritised buffer stores them; masks and next_masks (B, K) boolean,
-    which discrete actions the environment allowed in the state and in the next one, None without masking.
+    which discrete actions the environment allowed in the state and in the next one, None without masking. In a factored
+    space discrete_actions are (B, L) and masks (B, sum of the radices).
     """
 
     observations: PyTorchObs

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_chdp.common.checks import check_one_of
-from sb3_chdp.common.rows import RowLayout
+from sb3_chdp.common.rows import Array, RowLayout, value_table
 from sb3_chdp.common.space_tree import (
     DiscreteLeaf,
     Path,
@@ -24,7 +24,9 @@ from sb3_chdp.common.space_tree import (
 )
 
 MAX_DISCRETE_ACTIONS = 65_536
-LAYOUTS = ("auto", "per_action", "shared")
+# More joint discrete actions than these are factored unless the layout says otherwise
+FACTORED_ABOVE = 1024
+LAYOUTS = ("auto", "per_action", "shared", "joint", "factored")
 
 
 class HybridActionSpec:
@@ -38,16 +40,17 @@ class HybridActionSpec:
       ``OneOf((Box_1, ..., Box_K))``. An action without parameters is an empty ``Box``, ``Tuple`` or ``Dict``, or
       ``Discrete(1)``;
     * parameters shared by all actions: ``Tuple(Discrete(K), Box)``, and every product of several ``Discrete``,
-      ``MultiDiscrete`` or ``MultiBinary`` leaves with ``Box`` leaves. The discrete leaves form one joint index
-      (mixed radix, first leaf most significant).
+      ``MultiDiscrete`` or ``MultiBinary`` leaves with ``Box`` leaves. Up to 1,024 combinations the discrete leaves form one
+      joint index (mixed radix, first leaf most significant). Beyond that the space is factored: every digit of a leaf is a
+      choice of its own, and k has a column for each. ``layout="joint"`` and ``layout="factored"`` override the rule.
 
     A space with one ``Discrete(K)`` at the top and exactly K further parts can be read both ways. Rule: it is one box
     per action; ``layout="shared"`` overrides it.
 
     :param space: the native action space
-    :param layout: "auto" (the rule above), "per_action" or "shared"
+    :param layout: "auto" (the rules above), "per_action", "shared", "joint" (shared, one index) or "factored" (shared)
     :raises ValueError: for a space without discrete or continuous part, with unbounded or non-numeric boxes, with other
-        kinds of leaves, or with more than 65,536 joint discrete actions
+        kinds of leaves, with more than 65,536 discrete actions that are not factored, or with a single choice that shall be
     """
 
     def __init__(self, space: spaces.Space[Any], layout: str = "auto"):
@@ -55,8 +58,8 @@ class HybridActionSpec:
         self.space = space
         self.layout = layout
         if isinstance(space, spaces.OneOf):
-            if layout == "shared":
-                raise ValueError("action_layout='shared' does not apply to a OneOf space, whose parts exclude each other")
+            if layout not in ("auto", "per_action"):
+                raise ValueError(f"action_layout={layout!r} does not apply to a OneOf space, whose parts exclude each other")
             for i, option in enumerate(space.spaces):
                 if not is_parameter_space(option):
                     raise ValueError(f"action_space.spaces[{i}] of a OneOf must hold Box spaces only, got {option}")
@@ -64,7 +67,7 @@ class HybridActionSpec:
             options: list[tuple[Path, spaces.Space[Any]]] = [(("option",), option) for option in space.spaces]
             self.is_shared = False
         elif isinstance(space, (spaces.Tuple, spaces.Dict)):
-            choice = None if layout == "shared" else find_options(space)
+            choice = find_options(space) if layout in ("auto", "per_action") else None
             if choice is None and layout == "per_action":
                 raise ValueError(f"action_layout='per_action' needs a Discrete(K) and exactly K parameter spaces, got {space}")
             self.is_shared = choice is None
@@ -80,16 +83,23 @@ class HybridActionSpec:
                 f"The action space must be a Tuple, Dict or OneOf with a discrete and a continuous part, got {space}"
             )
 
-        self._radices = tuple(radix for leaf in self._discrete_leaves for radix in leaf.radices)
+        self._digits = tuple(radix for leaf in self._discrete_leaves for radix in leaf.radices)
         # Python integers: the product of many radices may overflow int64
         n_joint = len(options) if not self._discrete_leaves else 1
-        for radix in self._radices:
+        for radix in self._digits:
             n_joint *= radix
-        if n_joint > MAX_DISCRETE_ACTIONS:
+        can_factor = self.is_shared and len(self._digits) > 1
+        if layout == "factored" and not can_factor:
+            raise ValueError(f"action_layout='factored' needs several discrete parts, got {space}")
+        self.is_factored = can_factor and (layout == "factored" or (layout != "joint" and n_joint > FACTORED_ABOVE))
+        if n_joint > MAX_DISCRETE_ACTIONS and not self.is_factored:
+            hint = "; action_layout='factored' has no limit" if can_factor else ""
             raise ValueError(
-                f"{n_joint} joint discrete actions are more than the {MAX_DISCRETE_ACTIONS} supported, in {space}"
+                f"{n_joint} joint discrete actions are more than the {MAX_DISCRETE_ACTIONS} supported{hint}, in {space}"
             )
         self.n_discrete_actions = n_joint
+        #: numbers of values of the choices that a row makes: a single one, K, unless the space is factored
+        self.radices: tuple[int, ...] = self._digits if self.is_factored else (n_joint,)
         if isinstance(space, spaces.OneOf):
             self._boxes = [collect_boxes(part, path, f"action_space.spaces[{i}]") for i, (path, part) in enumerate(options)]
             # The part of the native action behind the index lives under the key "option" while it is being built
@@ -103,7 +113,7 @@ class HybridActionSpec:
         """Fill the (K, Pmax) tables: mask, centre and half range of every parameter, column in the concatenated vector."""
         sizes = [boxes[-1].columns.stop if boxes else 0 for boxes in self._boxes]
         self.max_parameters = max(sizes)
-        self.columns = RowLayout(discrete_actions=1, parameters=self.max_parameters)
+        self.columns = RowLayout(discrete_actions=len(self.radices), parameters=self.max_parameters)
         if self.max_parameters == 0:
             raise ValueError(f"{self.space} has no continuous part: use an algorithm for discrete actions, e.g. DQN or PPO")
         n_options = len(self._boxes)
@@ -118,38 +128,46 @@ class HybridActionSpec:
         offsets = np.cumsum([0, *sizes])
         self.n_parameters = int(offsets[-1])
         index = np.where(mask, offsets[:-1, None] + np.arange(self.max_parameters), 0)
-        # A shared layout has a single option that serves all K actions
-        shape = (self.n_discrete_actions, self.max_parameters)
+        # A shared layout has a single option that serves all K actions; in a factored one these are not to be counted
+        shape = (1 if self.is_factored else self.n_discrete_actions, self.max_parameters)
         self.mask, self._centre, self._half, self.parameter_index = (
             np.broadcast_to(table, shape) for table in (mask, centre, half, index)
         )
 
     @property
     def row_size(self) -> int:
-        """Length of a row ``[k | scaled parameters]``: 1 + Pmax."""
+        """Length of a row ``[k | scaled parameters]``: 1 + Pmax, L + Pmax if k is made of L choices."""
         return self.columns.width
 
     @cached_property
     def parameter_sizes(self) -> np.ndarray:
-        """(K,) number of parameters of every discrete action"""
+        """(K,) number of parameters of every discrete action, (1,) if it is the same for all of a factored space"""
         return self.mask.sum(axis=1)
 
     @property
     def n_mask_values(self) -> int:
         """Length of the masks of all discrete parts one after the other: the sum of their numbers of values."""
-        return sum(self._radices) or self.n_discrete_actions
+        return sum(self._digits) or self.n_discrete_actions
 
     def join_masks(self, masks: np.ndarray) -> np.ndarray:
         """
         :param masks: (n, n_mask_values) booleans, False for values of a discrete part that may not be taken
-        :return: (n, K) booleans, whether all values of a joint discrete action may be taken
+        :return: (n, K) booleans, whether all values of a joint discrete action may be taken; the masks as they are if the
+            space is factored
         """
-        if len(self._radices) <= 1:
+        if self.is_factored or len(self._digits) <= 1:
             return masks
         joint = np.ones((len(masks), 1), dtype=bool)
-        for part in np.split(masks, np.cumsum(self._radices)[:-1], axis=1):
+        for part in np.split(masks, np.cumsum(self._digits)[:-1], axis=1):
             joint = (joint[:, :, None] & part[:, None]).reshape(len(masks), -1)
         return joint
+
+    def options_of(self, choices: Array) -> Array:
+        """
+        :param choices: (n,) discrete actions, (n, L) of a factored space
+        :return: (n,) their rows in the tables of parameters: ``mask`` and ``parameter_index``
+        """
+        return choices if choices.ndim == 1 else choices[:, 0] * 0
 
     def to_native(self, row: np.ndarray) -> Any:
         """
@@ -165,14 +183,17 @@ class HybridActionSpec:
         """
         rows = np.asarray(rows)
         choices = self.columns.discrete_actions(rows)
-        if ((choices < 0) | (choices >= self.n_discrete_actions)).any():
-            raise ValueError(f"The first column of a row must be in 0..{self.n_discrete_actions - 1}, got {choices}")
+        largest = np.array(self.radices) - 1
+        if ((choices < 0) | (choices > (largest if self.is_factored else largest[0]))).any():
+            first = f"The first {len(largest)} columns" if self.is_factored else "The first column"
+            raise ValueError(f"{first} of a row must be in 0..{', 0..'.join(map(str, largest))}, got {choices}")
         scaled = np.clip(self.columns.view(rows, "parameters").astype(np.float64), -1.0, 1.0)
-        values = self._centre[choices] + self._half[choices] * scaled
-        return [self._assemble(int(k), v) for k, v in zip(choices, values, strict=True)]
+        options = self.options_of(choices)
+        values = self._centre[options] + self._half[options] * scaled
+        return [self._assemble(k, v) for k, v in zip(choices, values, strict=True)]
 
-    def _assemble(self, k: int, values: np.ndarray) -> Any:
-        option = 0 if self.is_shared else k
+    def _assemble(self, k: Any, values: np.ndarray) -> Any:
+        option = 0 if self.is_shared else int(k)
         native = self._templates[option if isinstance(self.space, spaces.OneOf) else 0]
         for box in self._boxes[option]:
             native = replace_part(native, box.path, cast_to_box(values[box.columns], box.space))
@@ -182,9 +203,11 @@ class HybridActionSpec:
             native = replace_part(native, leaf.path, self._native_digits(leaf, digits))
         return native
 
-    def _split_index(self, k: int) -> Iterator[np.ndarray]:
-        # A single Discrete is by far the most common case
-        digits = np.array([k] if len(self._radices) == 1 else np.unravel_index(k, self._radices))
+    def _split_index(self, k: Any) -> Iterator[np.ndarray]:
+        if not self.is_factored:
+            # A single Discrete is by far the most common case
+            k = [k] if len(self._digits) == 1 else np.unravel_index(int(k), self._digits)
+        digits = np.array(k)
         offset = 0
         for leaf in self._discrete_leaves:
             yield digits[offset : offset + len(leaf.radices)]
@@ -205,39 +228,46 @@ class HybridActionSpec:
         :return: (1 + Pmax,) float64 ``[k | scaled parameters]``, padding 0
         """
         if isinstance(self.space, spaces.OneOf):
-            k = int(action[0])
+            k = np.array([int(action[0])])
             action = {"option": action[1]}
         else:
-            digits = [np.ravel(get_part(action, leaf.path)) - leaf.start for leaf in self._discrete_leaves]
-            k = int(np.ravel_multi_index(tuple(np.concatenate(digits).astype(np.int64)), self._radices))
+            k = np.concatenate([np.ravel(get_part(action, leaf.path)) - leaf.start for leaf in self._discrete_leaves])
+            k = k.astype(np.int64)
+            if not self.is_factored:
+                k = np.array([np.ravel_multi_index(tuple(k), self._digits)])
+        option = 0 if self.is_shared else int(k[0])
         parameters = np.zeros(self.max_parameters)
-        for box in self._boxes[0 if self.is_shared else k]:
-            values = np.ravel(get_part(action, box.path)).astype(np.float64) - self._centre[k, box.columns]
-            half = self._half[k, box.columns]
+        for box in self._boxes[option]:
+            values = np.ravel(get_part(action, box.path)).astype(np.float64) - self._centre[option, box.columns]
+            half = self._half[option, box.columns]
             parameters[box.columns] = np.divide(values, half, out=np.zeros_like(values), where=half > 0)
-        return self.columns.pack(discrete_actions=np.array([k]), parameters=parameters[None])[0]
+        return self.columns.pack(discrete_actions=k[None], parameters=parameters[None])[0]
 
     def sample_choices(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
         """
         :param rng: random generator
         :param n: number of choices
-        :param masks: (n, K) False for discrete actions that may not be taken
-        :return: (n,) uniformly random discrete actions
+        :param masks: (n, sum of the radices) False for values that may not be taken
+        :return: (n,) uniformly random discrete actions, (n, L) of a factored space
         """
         if masks is None:
-            return rng.integers(self.n_discrete_actions, size=n)
-        ranks = rng.integers(masks.sum(axis=1))
-        return (masks.cumsum(axis=1) > ranks[:, None]).argmax(axis=1)
+            high = self.radices if self.is_factored else self.n_discrete_actions
+            return rng.integers(high, size=(n, len(self.radices)) if self.is_factored else n)
+        table, exists = value_table(self.radices)
+        allowed = masks[:, table] & exists
+        ranks = rng.integers(allowed.sum(axis=2))
+        choices = (allowed.cumsum(axis=2) > ranks[:, :, None]).argmax(axis=2)
+        return choices if self.is_factored else choices[:, 0]
 
     def sample_rows(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
         """
         :param rng: random generator
         :param n: number of rows
-        :param masks: (n, K) False for discrete actions that may not be taken
+        :param masks: (n, sum of the radices) False for values that may not be taken
         :return: (n, 1 + Pmax) rows, k uniform over the K actions, parameters uniform in [-1, 1], padding 0
         """
         choices = self.sample_choices(rng, n, masks)
-        parameters = rng.uniform(-1.0, 1.0, size=(n, self.max_parameters)) * self.mask[choices]
+        parameters = rng.uniform(-1.0, 1.0, size=(n, self.max_parameters)) * self.mask[self.options_of(choices)]
         return self.columns.pack(discrete_actions=choices, parameters=parameters)
 
     def own_parameters(self, choices: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -246,5 +276,6 @@ class HybridActionSpec:
         :param parameters: (n, P) scaled parameters of all actions, one after the other
         :return: (n, 1 + Pmax) rows of the chosen actions with their own parameters
         """
-        own_parameters = np.take_along_axis(parameters, self.parameter_index[choices], axis=1) * self.mask[choices]
+        options = self.options_of(choices)
+        own_parameters = np.take_along_axis(parameters, self.parameter_index[options], axis=1) * self.mask[options]
         return self.columns.pack(discrete_actions=choices, parameters=own_parameters)

@@ -1,4 +1,4 @@
-"""The eight benchmarks of the paper, registered with Gymnasium on import."""
+"""The eight benchmarks of the paper and a larger Hard Move, registered with Gymnasium on import."""
 
 from typing import Any
 
@@ -38,5 +38,8 @@ _register("CatchPoint-v0", "catch_point:CatchPointEnv", max_episode_steps=25)
 _register("HardMove-v0", "hard_move:HardMoveEnv", max_episode_steps=30)
 for n_actuators in (4, 6, 8, 10):
     _register(f"HardMove{n_actuators}-v0", "hard_move:HardMoveEnv", max_episode_steps=30, kwargs={"n_actuators": n_actuators})
+for n_actuators in (10, 12, 16, 20):
+    factored = {"n_actuators": n_actuators, "factored": True}
+    _register(f"FactoredHardMove{n_actuators}-v0", "hard_move:HardMoveEnv", max_episode_steps=30, kwargs=factored)
 
 __all__ = ["ENV_IDS"]

@@ -2,9 +2,10 @@
 
 from functools import lru_cache
 from math import cos, pi, sin
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from gymnasium import spaces
 
 from sb3_chdp.envs.point_mass import BONUS, CAPTURE_DISTANCE_SQUARED, FORCE, PANEL, Point, PointMassEnv
 
@@ -27,12 +28,30 @@ def motion_table(n_actuators: int) -> np.ndarray:
     return motions
 
 
+@lru_cache
+def unit_motions(n_actuators: int) -> np.ndarray:
+    """
+    :param n_actuators: number n of actuators
+    :return: (n, 2) motion of every actuator; with all that point to one side the sum has length 1, and no subset's is longer
+    """
+    angles = 2 * np.pi * np.arange(n_actuators) / n_actuators
+    directions = np.round(np.stack([np.cos(angles), np.sin(angles)], axis=1), 3)
+    # The longest sum is of all directions within a quarter turn of its own
+    middles = 2 * np.pi * np.arange(4 * n_actuators) / (4 * n_actuators)
+    towards = directions @ np.stack([np.cos(middles), np.sin(middles)])
+    sums = (towards > 1e-9).T @ directions
+    motions = directions / np.linalg.norm(sums, axis=1).max()
+    motions.setflags(write=False)
+    return motions
+
+
 class HardMoveEnv(PointMassEnv):
     """
     Move a point mass to a target with n actuators around it, of which every step switches on any subset.
 
-    Registered for n = 4, 6, 8 and 10 as `HardMove4-v0` to `HardMove10-v0`, and as `HardMove-v0` with the argument
-    `n_actuators`. The mass is 1, the damping 0.25, a step is a frame of 0.1 seconds. Transitions have no noise.
+    Registered for n = 4, 6, 8 and 10 as `HardMove4-v0` to `HardMove10-v0`, factored for n = 10, 12, 16 and 20 as
+    `FactoredHardMove10-v0` to `FactoredHardMove20-v0`, and as `HardMove-v0` with the arguments `n_actuators` and `factored`.
+    The mass is 1, the damping 0.25, a step is a frame of 0.1 seconds. Transitions have no noise.
 
     ## Action space
 
@@ -41,6 +60,8 @@ class HardMoveEnv(PointMassEnv):
     | k | action | parameter | range |
     |---|---|---|---|
     | 0 to 2^n - 1 | push with a subset of the actuators | strength, backwards if negative | -1 to 1 |
+
+    With `factored=True`: `Tuple(MultiBinary(n), Box(-1, 1, (1,)))`, which actuators are on, and the strength.
 
     The bits of k say which actuators are on, actuator 0 is the highest. Actuator i pushes at the angle 2 pi i / n from +x. The
     force is twice the strength times `motion_table(n)[k]`, the sum of the subset's directions, scaled so that the longest sum
@@ -71,11 +92,12 @@ class HardMoveEnv(PointMassEnv):
 
     | argument | default | meaning |
     |---|---|---|
-    | `n_actuators` | 4 | number n of actuators, 2 to 16 |
+    | `n_actuators` | 4 | number n of actuators, 2 to 16, or more if factored |
     | `start` | None | (x, y) at which the agent starts; None draws it |
     | `target` | None | (x, y) of the target; None draws it |
     | `noise` | True | without effect, nothing is random but the start |
     | `render_mode` | None | None, "human" or "rgb_array" |
+    | `factored` | False | whether an action says of every actuator whether it is on, instead of numbering subsets |
 
     ## Reset options
 
@@ -102,20 +124,45 @@ class HardMoveEnv(PointMassEnv):
         target: Point | None = None,
         noise: bool = True,
         render_mode: str | None = None,
+        factored: bool = False,
     ):
-        if not 2 <= n_actuators <= 16:
-            raise ValueError(f"n_actuators must be between 2 and 16, got {n_actuators}")
+        if n_actuators < 2 or (n_actuators > 16 and not factored):
+            raise ValueError(f"n_actuators must be between 2 and 16, or more than that if factored=True, got {n_actuators}")
         super().__init__(start, target, noise, render_mode)
         self.n_actuators = n_actuators
-        self._motions = motion_table(n_actuators).tolist()
-        self._set_action_space([[(-1.0, 1.0)]] * len(self._motions))
+        self.factored = factored
+        if factored:
+            self._motions = unit_motions(n_actuators).tolist()
+            self.action_space = spaces.Tuple((spaces.MultiBinary(n_actuators), spaces.Box(-1.0, 1.0, (1,), np.float32)))
+        else:
+            self._motions = motion_table(n_actuators).tolist()
+            self._set_action_space([[(-1.0, 1.0)]] * len(self._motions))
+
+    def _decode(self, action: Any) -> tuple[int, list[float]]:
+        if not self.factored:
+            return super()._decode(action)
+        try:
+            bits = [int(bit) for bit in action[0]]
+            (strength,) = (float(value) for value in action[1])
+        except (TypeError, IndexError, ValueError) as error:
+            raise ValueError(f"action must be (n bits, (strength,)) as in action_space, got {action!r}") from error
+        if len(bits) != self.n_actuators or not set(bits) <= {0, 1} or strength - strength != 0.0:
+            raise ValueError(f"action must be in the action space; got the bits {bits} with the strength {strength}")
+        return int("".join(map(str, bits)), 2), [strength]
 
     def _advance(self, k: int, parameters: list[float]) -> tuple[float, str, int]:
         return self._push_with(k, parameters[0])
 
+    def _motion_of(self, subset: int) -> Point:
+        if not self.factored:
+            x, y = self._motions[subset]
+            return x, y
+        active = [motion for i, motion in enumerate(reversed(self._motions)) if subset >> i & 1]
+        return sum(x for x, _ in active), sum(y for _, y in active)
+
     def _push_with(self, subset: int, strength: float) -> tuple[float, str, int]:
         """:param subset: active actuators as the bits of a number, actuator 0 the highest"""
-        motion_x, motion_y = self._motions[subset]
+        motion_x, motion_y = self._motion_of(subset)
         distance_squared = self._push(FORCE * strength * motion_x, FORCE * strength * motion_y)
         if distance_squared <= CAPTURE_DISTANCE_SQUARED:
             return self._result(BONUS - distance_squared, "reached")
@@ -136,7 +183,7 @@ class HardMoveEnv(PointMassEnv):
             canvas.disc(position, 11 if self.n_actuators <= 10 else 8, colour if active else GREY)
             canvas.text(str(actuator), position, WHITE if active else INK, 20, centred=True)
         if self._action is not None:
-            canvas.text(f"subset {subset} of {len(self._motions)}", (150, 44))
+            canvas.text(f"subset {subset} of {2**self.n_actuators}", (150, 44))
             canvas.text(f"strength {strength:+.2f}", (150, 20))
             canvas.rectangle((300, 16), (160, 8), GREY, 4)
             length = 80 * min(abs(strength), 1.0)

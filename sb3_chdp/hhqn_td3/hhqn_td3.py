@@ -38,5 +38,7 @@ class HHQNTD3(HybridTD3):
         "MultiInputPolicy": MultiInputPolicy,
     }
 
+    takes_factored = True
+
     def _make_hybrid_space(self) -> HybridBox:
         return ScoreBox(self.action_space, self.action_layout, self._mask_parts())

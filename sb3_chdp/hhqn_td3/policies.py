@@ -34,8 +34,9 @@ class HierarchicalActor(Actor):
             return nn.Sequential(*layers, *end)
 
         # In place of the one-stage actor
-        self.mu = mlp(self.features_dim, spec.n_discrete_actions)
-        self.lower = mlp(self.features_dim + spec.n_discrete_actions, spec.n_parameters)
+        n_scores = sum(spec.radices)
+        self.mu = mlp(self.features_dim, n_scores)
+        self.lower = mlp(self.features_dim + n_scores, spec.n_parameters)
 
     def forward(self, obs: PyTorchObs, noise: th.Tensor | None = None, action_masks: th.Tensor | None = None) -> th.Tensor:
         """

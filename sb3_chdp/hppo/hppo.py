@@ -112,6 +112,7 @@ class HPPO(HybridAlgorithm, PPO):
         "use_masking": optional(SWITCH),
     }
     policy: HPPOPolicy
+    takes_factored = True
 
     def __init__(
         self,

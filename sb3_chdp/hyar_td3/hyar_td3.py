@@ -10,6 +10,7 @@ from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
 
 from sb3_chdp.common.arguments import RATE, Accepted, of_networks, whole
 from sb3_chdp.common.hybrid_box import HybridBox
+from sb3_chdp.common.product_table import block_widths
 from sb3_chdp.common.samples import HybridReplaySamples
 from sb3_chdp.common.td3 import HybridTD3
 from sb3_chdp.common.utils import gradient_step
@@ -53,7 +54,7 @@ class HyARTD3(HybridTD3):
     :param buffer_size: size of the replay buffer, which also feeds the representation
     :param learning_starts: number of random steps at first; the representation is warmed up on them
     :param target_policy_noise: standard deviation of the noise on the target latents
-    :param embedding_dim: width of the embedding of a discrete action
+    :param embedding_dim: width of the embedding of a discrete action, at most that of one choice of a factored space
     :param parameter_latent_dim: width of the latent z of the parameters
     :param representation_learning_rate: learning rate of the representation
     :param representation_batch_size: its minibatch size
@@ -77,6 +78,7 @@ class HyARTD3(HybridTD3):
         "representation_steps": whole(1),
     }
     policy: HyARTD3Policy
+    takes_factored = True
 
     def __init__(
         self,
@@ -121,7 +123,8 @@ class HyARTD3(HybridTD3):
             self._setup_model()
 
     def _make_hybrid_space(self) -> HybridBox:
-        latent_dim = self.embedding_dim + self.parameter_latent_dim
+        radices = HybridBox(self.action_space, self.action_layout).spec.radices
+        latent_dim = sum(block_widths(radices, self.embedding_dim)) + self.parameter_latent_dim
         return HybridBox(self.action_space, self.action_layout, latent_dim, self._mask_parts())
 
     def _network_kwargs(self) -> dict[str, Any]:

@@ -9,8 +9,9 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.policies import CnnFeatures, CombinedFeatures
+from sb3_chdp.common.product_table import block_widths
 from sb3_chdp.common.td3 import HybridTD3Policy
-from sb3_chdp.hyar_td3.representation import ActionRepresentation
+from sb3_chdp.hyar_td3.representation import ActionRepresentation, FactoredActionRepresentation
 
 
 class HyARTD3Policy(HybridTD3Policy):
@@ -20,7 +21,7 @@ class HyARTD3Policy(HybridTD3Policy):
     Actor and critic work on latents in [-1, 1]. The representation sees the features of the target critic, which are the
     observation itself for vectors. The arguments are those of :class:`HybridTD3Policy`, and
 
-    :param embedding_dim: width of the embedding of a discrete action
+    :param embedding_dim: width of the embedding of a discrete action, at most that of one choice of a factored space
     :param representation_hidden_dim: units of the hidden layers of the representation
     """
 
@@ -36,13 +37,15 @@ class HyARTD3Policy(HybridTD3Policy):
         latent_space = spaces.Box(-1.0, 1.0, (latent_dim,), dtype=np.float32)
         self.actor_kwargs["action_space"] = self.critic_kwargs["action_space"] = latent_space
         super()._build(lr_schedule)
-        self.representation = ActionRepresentation(
-            self.critic_target.features_extractor.features_dim,
-            th.tensor(self.action_space.spec.mask),
-            self.embedding_dim,
-            latent_dim - self.embedding_dim,
-            self.representation_hidden_dim,
-        )
+        spec, features_dim = self.action_space.spec, self.critic_target.features_extractor.features_dim
+        #: width of the embeddings of all choices
+        self.embedding_width = sum(block_widths(spec.radices, self.embedding_dim))
+        latent_dims = (self.embedding_dim, latent_dim - self.embedding_width, self.representation_hidden_dim)
+        self.representation: ActionRepresentation
+        if spec.is_factored:
+            self.representation = FactoredActionRepresentation(features_dim, spec.radices, spec.max_parameters, *latent_dims)
+        else:
+            self.representation = ActionRepresentation(features_dim, th.tensor(spec.mask), *latent_dims)
         self.representation_optimizer = self.optimizer_class(
             self.representation.parameters(),
             lr=lr_schedule(1),  # type: ignore[call-arg]  # set before every update
@@ -62,7 +65,7 @@ class HyARTD3Policy(HybridTD3Policy):
         :return: (B, columns) rows, with z not scaled: bounds may change before it is used
         """
         latents = self.mask_outputs(latents, action_masks)
-        embeddings, scaled_z = latents[:, : self.embedding_dim], latents[:, self.embedding_dim :]
+        embeddings, scaled_z = latents[:, : self.embedding_width], latents[:, self.embedding_width :]
         k = self.representation.nearest_action(embeddings, action_masks)
         z = self.representation.unscale(scaled_z)
         parameters, _ = self.representation.decode(self.state_features(obs), k, z)
@@ -78,12 +81,9 @@ class HyARTD3Policy(HybridTD3Policy):
         """
         if action_masks is None:
             return outputs
-        with th.no_grad():
-            embeddings = outputs[:, : self.embedding_dim]
-            allowed = self.representation.nearest_action(embeddings, action_masks)
-            is_allowed = self.representation.nearest_action(embeddings) == allowed
-            moves = th.where(is_allowed[:, None], 0.0, self.representation.embed(allowed) - embeddings)
-        return outputs + th.nn.functional.pad(moves, (0, outputs.shape[1] - self.embedding_dim))
+        embeddings = outputs[:, : self.embedding_width]
+        moves = self.representation.to_allowed(embeddings, action_masks) - embeddings.detach()
+        return outputs + th.nn.functional.pad(moves, (0, outputs.shape[1] - self.embedding_width))
 
     def _predict(
         self, observation: PyTorchObs, deterministic: bool = False, action_masks: th.Tensor | None = None

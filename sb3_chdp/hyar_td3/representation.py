@@ -6,6 +6,7 @@ import torch as th
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_chdp.common.product_table import ProductTable
 from sb3_chdp.common.utils import nearest_row
 
 # Weights of the reconstruction of the parameters and of the KL term, relative to the prediction of the state's change
@@ -26,7 +27,7 @@ class ActionBatch(NamedTuple):
     """
     Actions and what they did, for the representation to learn from.
 
-    Shapes: features (B, features_dim), discrete_actions (B,) int64, parameters (B, Pmax) in [-1, 1] with padding 0,
+    Shapes: features (B, features_dim), discrete_actions (B,) int64 or (B, L), parameters (B, Pmax) in [-1, 1] with padding 0,
     changes (B, features_dim), the difference between the next features and these.
     """
 
@@ -97,6 +98,25 @@ class ActionRepresentation(nn.Module):
         """:return: (B,) discrete actions whose embeddings are nearest to (B, d1) points, of those that (B, K) masks allow"""
         return nearest_row(embeddings, th.tanh(self.table), masks)
 
+    def mask_of(self, k: th.Tensor) -> th.Tensor:
+        """:return: (B, Pmax) 1 for the parameters that discrete actions have"""
+        return self.parameter_mask[k]
+
+    def per_column(self, per_action: th.Tensor) -> th.Tensor:
+        """:return: (B, d1) or (B, 1) what (B,) booleans say of the columns of embeddings"""
+        return per_action[:, None]
+
+    @th.no_grad()
+    def to_allowed(self, embeddings: th.Tensor, masks: th.Tensor) -> th.Tensor:
+        """
+        :param embeddings: (B, d1) points
+        :param masks: (B, K) False for discrete actions that may not be taken
+        :return: (B, d1) the same, with the nearest allowed embedding in place of one that stands for a forbidden action
+        """
+        allowed = self.nearest_action(embeddings, masks)
+        keep = self.nearest_action(embeddings) == allowed
+        return th.where(self.per_column(keep), embeddings, self.embed(allowed))
+
     def scale(self, z: th.Tensor) -> th.Tensor:
         """:return: z with the latent bounds mapped to [-1, 1], clipped"""
         half = ((self.latent_high - self.latent_low) / 2).clamp(min=MIN_HALF_RANGE)
@@ -123,7 +143,7 @@ class ActionRepresentation(nn.Module):
         """
         condition = th.cat([features, self.embed(k)], dim=1)
         hidden = self.decoder(F.relu(self.decoder_condition(condition)) * F.relu(self.decoder_input(z)))
-        return self.parameter_head(hidden) * self.parameter_mask[k], self.dynamics_head(hidden)
+        return self.parameter_head(hidden) * self.mask_of(k), self.dynamics_head(hidden)
 
     def loss(self, batch: ActionBatch, noise: th.Tensor | None = None) -> th.Tensor:
         """
@@ -136,7 +156,7 @@ class ActionRepresentation(nn.Module):
         mean, log_std = self.encode(batch)
         noise = th.randn_like(mean) if noise is None else noise
         parameters, changes = self.decode(batch.features, batch.discrete_actions, mean + log_std.exp() * noise)
-        mask = self.parameter_mask[batch.discrete_actions]
+        mask = self.mask_of(batch.discrete_actions)
         # Padding does not count
         reconstruction = ((parameters - batch.parameters).square() * mask).sum() / mask.sum().clamp(min=1)
         kl_divergence = 0.5 * (mean.square() + (2 * log_std).exp() - 1 - 2 * log_std).mean()
@@ -175,13 +195,56 @@ class ActionRepresentation(nn.Module):
         known = th.isfinite(latents).all(dim=1)
         embeddings, z = th.nan_to_num(embeddings), th.nan_to_num(z)
 
-        keep_embedding = known & (self.nearest_action(embeddings) == k)
+        keep_embedding = self.per_column(self.nearest_action(embeddings) == k) & known[:, None]
         noise = (th.randn_like(embeddings) * EMBEDDING_NOISE).clamp(-EMBEDDING_NOISE_CLIP, EMBEDDING_NOISE_CLIP)
-        embeddings = th.where(keep_embedding[:, None], embeddings, self.embed(k) + noise)
+        embeddings = th.where(keep_embedding, embeddings, self.embed(k) + noise)
 
         _, changes = self.decode(batch.features, k, z)
         errors = (changes - batch.changes).square().mean(dim=1)
         keep_z = known & (errors < SHIFT_TOLERANCE * self.usual_error)
         z = th.where(keep_z[:, None], z, self.encode(batch)[0])
         latents = th.cat([embeddings.clamp(-1, 1), self.scale(z)], dim=1)
-        return latents, th.stack([keep_embedding, keep_z], dim=1)
+        return latents, th.stack([keep_embedding.all(dim=1), keep_z], dim=1)
+
+
+class FactoredActionRepresentation(ActionRepresentation):
+    """
+    :class:`ActionRepresentation` of actions that are made of L choices, each with embeddings of its own: a policy's first part
+    is their concatenation, and each block stands for the value of the nearest embedding.
+
+    :param features_dim: width of the state features
+    :param radices: numbers of values of the choices
+    :param n_parameters: number of parameters, which all actions share
+    :param embedding_dim: width of an embedding at most, see :func:`block_widths`
+    :param parameter_latent_dim: width of z (d2)
+    :param hidden_dim: units of the hidden layers
+    """
+
+    def __init__(
+        self,
+        features_dim: int,
+        radices: tuple[int, ...],
+        n_parameters: int,
+        embedding_dim: int,
+        parameter_latent_dim: int,
+        hidden_dim: int = 256,
+    ):
+        tables = ProductTable(radices, embedding_dim)
+        super().__init__(features_dim, th.ones(1, n_parameters), tables.width, parameter_latent_dim, hidden_dim)
+        # In place of the one of a single choice
+        del self.table
+        self.tables = tables
+
+    def embed(self, k: th.Tensor) -> th.Tensor:
+        """:return: (B, d1) embeddings of (B, L) values, one after the other"""
+        return self.tables(k, th.tanh(self.tables.vectors))
+
+    def nearest_action(self, embeddings: th.Tensor, masks: th.Tensor | None = None) -> th.Tensor:
+        """:return: (B, L) values whose embeddings are nearest to the blocks of (B, d1) points, of those that masks allow"""
+        return self.tables.nearest(embeddings, masks, th.tanh(self.tables.vectors))
+
+    def mask_of(self, k: th.Tensor) -> th.Tensor:
+        return self.parameter_mask.expand(len(k), -1)
+
+    def per_column(self, per_action: th.Tensor) -> th.Tensor:
+        return per_action[:, self.tables.choice_of_slot]

@@ -1,0 +1,96 @@
+"""A codebook per choice: what a latent of several blocks decodes to."""
+
+import pytest
+import torch as th
+
+from sb3_chdp.chdp.codebook import Codebook
+from sb3_chdp.chdp.product_codebook import ProductCodebook, choice_usage
+from sb3_chdp.common.product_table import block_widths, random_values
+
+RADICES = (3, 2, 5, 1)
+
+
+def test_blocks_are_as_wide_as_they_need_to_be():
+    assert block_widths(RADICES, 8) == (2, 1, 4, 1)
+    assert block_widths(RADICES, 2) == (2, 1, 2, 1)
+    assert block_widths((64,), 8) == (8,)
+    assert ProductCodebook((2,) * 77, 8).latent_dim == 77
+
+
+def codewords_of(codebook, choice):
+    """:return: the codewords of one choice, in its block of the latent"""
+    k = th.zeros(RADICES[choice], len(RADICES), dtype=th.long)
+    k[:, choice] = th.arange(RADICES[choice])
+    start = sum(block_widths(RADICES, 3)[:choice])
+    return codebook(k)[:, start : start + block_widths(RADICES, 3)[choice]]
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_nearest_codewords_block_by_block(masked):
+    th.manual_seed(0)
+    codebook = ProductCodebook(RADICES, 3)
+    latents = th.rand(200, codebook.latent_dim) * 2 - 1
+    masks = (th.rand(200, sum(RADICES)) < 0.5) if masked else None
+    if masks is not None:
+        masks[:, [0, 3, 5, 10]] = True
+    k = codebook.quantize(latents, masks)
+    blocks = latents.split(block_widths(RADICES, 3), dim=1)
+    for choice, block in enumerate(blocks):
+        distances = th.cdist(block, codewords_of(codebook, choice))
+        if masks is not None:
+            distances = distances.masked_fill(~masks.split(RADICES, dim=1)[choice], th.inf)
+        assert (k[:, choice] == distances.argmin(dim=1)).all()
+
+
+def test_a_single_choice_is_the_codebook():
+    th.manual_seed(0)
+    codebook, product = Codebook(9, 4), ProductCodebook((9,), 4)
+    with th.no_grad():
+        product.vectors[0] = codebook.codewords
+    latents, k = th.rand(50, 4) * 2 - 1, th.randint(9, (50,))
+    assert (product.quantize(latents)[:, 0] == codebook.quantize(latents)).all()
+    assert (product(k[:, None]) == codebook(k)).all()
+    assert (product.representative_latents(k[:, None]) == codebook.representative_latents(k)).all()
+
+
+def test_codewords_decode_to_themselves_and_learn():
+    th.manual_seed(0)
+    codebook = ProductCodebook(RADICES, 3)
+    k = random_values(RADICES, (4, 50))
+    assert k.shape == (4, 50, 4) and all(set(k[..., i].flatten().tolist()) == set(range(n)) for i, n in enumerate(RADICES))
+    latents = codebook.representative_latents(k)
+    assert latents.shape == (4, 50, codebook.latent_dim) and not latents.requires_grad
+    assert (codebook.quantize(latents.flatten(0, 1)) == k.flatten(0, 1)).all()
+    before = codebook.representative_latents(k)
+    optimizer = th.optim.Adam(codebook.parameters(), lr=2.0)
+    codebook(k).square().sum().backward()
+    optimizer.step()
+    assert (codebook.representative_latents(k).abs() > 1).any()
+    codebook.project()
+    after = codebook.representative_latents(k)
+    assert after.abs().max() <= 1 and (after != before).all()
+    assert codebook.quantize(after.flatten(0, 1)).shape == (200, 4)
+
+
+def test_random_choices_repeat_with_a_generator():
+    first, second = (random_values((7, 7), (30,), generator=th.Generator().manual_seed(3)) for _ in range(2))
+    assert (first == second).all()
+
+
+def test_random_values_are_uniform_over_what_masks_allow():
+    th.manual_seed(0)
+    masks = th.zeros(2, sum(RADICES), dtype=th.bool)
+    masks[0, [0, 2, 4, 5, 7, 8, 10]] = True
+    masks[1] = True
+    k = random_values(RADICES, (2, 3000), masks)
+    for row, allowed in enumerate(([{0, 2}, {1}, {0, 2, 3}, {0}], [set(range(n)) for n in RADICES])):
+        for choice, values in enumerate(allowed):
+            counts = th.bincount(k[row, :, choice], minlength=RADICES[choice])
+            assert set(counts.nonzero().flatten().tolist()) == values
+            assert (counts[list(values)] - 3000 / len(values)).abs().max() < 4 * 3000**0.5
+
+
+def test_usage_is_a_mean_over_the_choices():
+    k = th.tensor([[0, 0], [1, 0], [0, 0], [1, 0]])
+    usage, perplexity = choice_usage(k, (2, 4))
+    assert usage == pytest.approx((1 + 0.25) / 2) and perplexity == pytest.approx((2 + 1) / 2)
