@@ -11,7 +11,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import VecCheckNan, VecEnv, is_vecenv_wrapped
 
-from sb3_chdp.common.checks import check_policy_kwargs
+from sb3_chdp.common.checks import check_observation_space, check_policy_kwargs
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.native_env import NativeActionVecEnv
 from sb3_chdp.common.safe_zip import VERSION, misfit, read_model, save_model
@@ -37,6 +37,9 @@ class HybridAlgorithm(BaseAlgorithm):
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        # SB3 converts the spaces of the old gym
+        if isinstance(env.observation_space, spaces.Space):
+            check_observation_space(env.observation_space)
         vec_env = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         if is_vecenv_wrapped(vec_env, VecCheckNan):
             raise ValueError(

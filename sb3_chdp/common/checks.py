@@ -5,6 +5,7 @@ from collections.abc import Collection
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
 
 def check_at_least(least: int, **arguments: int) -> None:
@@ -53,6 +54,29 @@ def check_finite(name: str, value: Any) -> None:
         rows = value.reshape(len(value), -1) if value.ndim > 1 else value[:, None]
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=1)).tolist()
         raise ValueError(f"{name} must be finite, got NaN or inf from environment(s) {bad}: {value[bad]}")
+
+
+def check_observation_space(space: spaces.Space[Any]) -> None:
+    """
+    :param space: the observation space of an environment
+    :raises ValueError: if SB3's policies cannot read its observations; the message says how they can
+    """
+    parts = {f"observation_space[{key!r}]": part for key, part in space.items()} if isinstance(space, spaces.Dict) else None
+    for name, part in (parts or {"observation_space": space}).items():
+        is_flat = isinstance(part, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary))
+        starts_elsewhere = np.any(getattr(part, "start", 0))
+        if is_flat and not starts_elsewhere and not (isinstance(part, spaces.MultiDiscrete) and len(part.shape) > 1):
+            continue
+        remedy = (
+            "flatten the observations to one vector with gymnasium.wrappers.FlattenObservation(env)"
+            if space.is_np_flattenable
+            else "give the observations a fixed size, for example by padding them to a Box"
+        )
+        what = f"{part}" if starts_elsewhere else f"a {type(part).__name__}"
+        raise ValueError(
+            f"{name} is {what}, but SB3's policies read Box, Discrete, MultiDiscrete (of one dimension) and MultiBinary, the "
+            f"discrete ones from 0 on, and a Dict of these; {remedy}"
+        )
 
 
 def check_policy_kwargs(policy_class: type, policy_kwargs: dict[str, Any]) -> None:
