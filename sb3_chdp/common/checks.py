@@ -7,6 +7,11 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_chdp.common.space_tree import leaves_of
+
+# What gymnasium.wrappers.FlattenObservation makes a vector of
+FLATTENABLE = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Text, spaces.OneOf)
+
 
 def check_at_least(least: int, **arguments: int) -> None:
     """
@@ -69,7 +74,7 @@ def check_observation_space(space: spaces.Space[Any]) -> None:
             continue
         remedy = (
             "flatten the observations to one vector with gymnasium.wrappers.FlattenObservation(env)"
-            if space.is_np_flattenable
+            if all(isinstance(leaf, FLATTENABLE) for _, leaf in leaves_of(space))
             else "give the observations a fixed size, for example by padding them to a Box"
         )
         what = f"{part}" if starts_elsewhere else f"a {type(part).__name__}"
