@@ -1,4 +1,4 @@
-"""What every example does: train with the defaults, and compare the return with that of random actions and of a simple rule."""
+"""What every example does: train with the defaults, and compare with random actions and with a simple rule."""
 
 import argparse
 import re
@@ -31,6 +31,21 @@ def mean_return(env: gym.Env, act: Callable[[Any], Any], n_episodes: int) -> flo
             obs, reward, terminated, truncated, _ = env.step(act(obs))
             total, over = total + float(reward), terminated or truncated
     return total / n_episodes
+
+
+def write_row(page: Path, name: str, cells: str) -> None:
+    """
+    Put what was measured into the row of a Markdown table.
+
+    :param page: the Markdown file
+    :param name: first cell of the row
+    :param cells: the cells behind it
+    :raises ValueError: if no row begins with the name
+    """
+    text, n_rows = re.subn(rf"^\| {re.escape(name)} \|.*$", f"| {name} | {cells} |", page.read_text(), flags=re.MULTILINE)
+    if n_rows == 0:
+        raise ValueError(f"no row of a table in {page} begins with {name!r}")
+    page.write_text(text)
 
 
 def compare(env: gym.Env, rule: Callable[[gym.Env], Any], n_timesteps: int, name: str) -> None:
@@ -70,5 +85,4 @@ def compare(env: gym.Env, rule: Callable[[gym.Env], Any], n_timesteps: int, name
         print(f"{what:16} {value:.1f}")
     if args.write:
         settings = f"{ALGORITHMS[args.algo].display_name} | {args.steps:,} | {len(args.seeds)}"
-        row = f"| {name} | {settings} | {' | '.join(f'{value:.1f}' for value in returns.values())} |"
-        PAGE.write_text(re.sub(rf"^\| {re.escape(name)} \|.*$", row, PAGE.read_text(), flags=re.MULTILINE))
+        write_row(PAGE, name, f"{settings} | {' | '.join(f'{value:.1f}' for value in returns.values())}")
