@@ -18,8 +18,8 @@ from sb3_chdp.common.space_mismatch import mismatch
 from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.wrappers import FlattenHybridAction, with_scalars
 
-# Discrete actions that are played with extreme parameters
-N_EXTREMES = 20
+# Random discrete actions that are played with extreme parameters
+N_EXTREMES = 40
 # Random play ends after so many episodes, or steps if they do not end
 N_EPISODES = 3
 N_STEPS = 10_000
@@ -176,20 +176,18 @@ class _Player:
         return ". It works with numbers in place of arrays of one element: wrap the environment in sb3_chdp.ScalarBoxes(env)"
 
     def play_extremes(self) -> None:
-        """Play discrete actions with all parameters at one of their ends."""
+        """Play random discrete actions with all parameters at one of their ends."""
         parameters = inspect.signature(self.env.unwrapped.reset).parameters
         if "seed" not in parameters and all(p.kind is not p.VAR_KEYWORD for p in parameters.values()):
             raise AssertionError("reset() has no argument seed: write def reset(self, *, seed=None, options=None)")
         self.reset(seed=0)
-        rows = self.spec.sample_rows(np.random.default_rng(0), N_EXTREMES)
-        if self.spec.n_discrete_actions <= N_EXTREMES:
-            self.spec.columns.view(rows, "discrete_actions")[:, 0] = np.arange(N_EXTREMES) % self.spec.n_discrete_actions
-        for row in rows:
-            for end in (-1.0, 1.0):
-                self.spec.columns.view(row, "parameters")[:] = end
-                *_, terminated, truncated = self.step(self.spec.to_native(row))
-                if terminated or truncated:
-                    self.reset()
+        rng = np.random.default_rng(0)
+        for i in range(N_EXTREMES):
+            row = self._random_row(rng)
+            self.spec.columns.view(row, "parameters")[:] = (-1.0, 1.0)[i % 2]
+            *_, terminated, truncated = self.step(self.spec.to_native(row))
+            if terminated or truncated:
+                self.reset()
 
     def play_episodes(self) -> None:
         """Play at random until some episodes have ended."""
@@ -197,7 +195,7 @@ class _Player:
         obs, length = self.reset(seed=0), 0
         for _ in range(N_STEPS):
             kept, before = obs, deepcopy(obs)
-            obs, _, terminated, truncated = self.step(self._random_action(rng))
+            obs, _, terminated, truncated = self.step(self.spec.to_native(self._random_row(rng)))
             self.overwrites |= not data_equivalence(kept, before, exact=True)
             length += 1
             if terminated or truncated:
@@ -206,8 +204,8 @@ class _Player:
                     break
                 obs, length = self.reset(), 0
 
-    def _random_action(self, rng: np.random.Generator) -> Any:
-        return self.spec.to_native(self.spec.sample_rows(rng, 1)[0])
+    def _random_row(self, rng: np.random.Generator) -> np.ndarray:
+        return self.spec.sample_rows(rng, 1)[0]
 
     def oddities(self) -> list[str]:
         """:return: what is legal but most likely not meant, in the episodes played"""
@@ -236,7 +234,7 @@ class _Player:
             rng = np.random.default_rng(1)
             run: list[Any] = [deepcopy(self.reset(seed=1))]
             for _ in range(N_COMPARED):
-                answer = self.step(self._random_action(rng))
+                answer = self.step(self.spec.to_native(self._random_row(rng)))
                 run.append(deepcopy(answer))
                 if answer[2] or answer[3]:
                     break
