@@ -5,7 +5,7 @@ SHELL := bash
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-SOURCES := sb3_chdp tests benchmarks docs
+SOURCES := sb3_chdp tests benchmarks docs examples
 # Small networks are fastest on one thread
 export OMP_NUM_THREADS ?= 1
 

@@ -5,13 +5,13 @@ from sb3_chdp import envs  # registers the environments
 from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.env_checker import check_hybrid_env
 from sb3_chdp.registry import ALGORITHMS
-from sb3_chdp.wrappers import FlattenHybridAction
+from sb3_chdp.wrappers import FlattenHybridAction, ScalarBoxes
 
 __version__ = Path(__file__).with_name("version.txt").read_text().strip()
 
 _ALGORITHMS = {algorithm.class_name: algorithm for algorithm in ALGORITHMS.values()}
 
-__all__ = ["ALGORITHMS", "FlattenHybridAction", "HybridActionSpec", "check_hybrid_env", "envs"]
+__all__ = ["ALGORITHMS", "FlattenHybridAction", "HybridActionSpec", "ScalarBoxes", "check_hybrid_env", "envs"]
 __all__ += list(_ALGORITHMS)
 
 

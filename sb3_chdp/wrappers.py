@@ -1,9 +1,10 @@
-"""Wrappers that bring hybrid environments to algorithms for flat actions."""
+"""Wrappers that bring hybrid environments and algorithms together."""
 
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 
 from sb3_chdp.common.hybrid_box import ScoreBox
 
@@ -30,3 +31,36 @@ class FlattenHybridAction(gym.ActionWrapper[np.ndarray, np.ndarray, Any]):
         :return: the native action
         """
         return self.score_space.to_native(np.asarray(action)[None])[0]
+
+
+class ScalarBoxes(gym.ActionWrapper[Any, Any, Any]):
+    """
+    For environments whose ``step`` wants a number where their action space says ``Box`` of one element.
+
+    The action space stays as it is. On the way to the environment, every array of a box with one element becomes a
+    Python number, also inside ``Tuple``, ``Dict`` and ``OneOf``.
+
+    :param env: environment with a hybrid action space
+    """
+
+    def action(self, action: Any) -> Any:
+        """
+        :param action: an action of the action space
+        :return: the same with numbers in place of arrays with one element
+        """
+        return with_scalars(self.action_space, action)
+
+
+def with_scalars(space: spaces.Space[Any], action: Any) -> Any:
+    """
+    :param space: an action space, or a part of one
+    :param action: an action of it
+    :return: the same with numbers in place of the arrays of boxes with one element
+    """
+    if isinstance(space, spaces.Tuple):
+        return tuple(with_scalars(part, value) for part, value in zip(space.spaces, action, strict=True))
+    if isinstance(space, spaces.Dict):
+        return {key: with_scalars(part, action[key]) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.OneOf):
+        return action[0], with_scalars(space.spaces[int(action[0])], action[1])
+    return np.asarray(action).item() if isinstance(space, spaces.Box) and np.prod(space.shape) == 1 else action

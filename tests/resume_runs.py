@@ -12,14 +12,14 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_chdp
-from sb3_chdp.common import checkpoint_store, replay_store
+from sb3_chdp import PATD3
 from sb3_chdp.common.resume import ResumableCheckpoint, resume
 from tests.algorithms import make_model
 from tests.hybrid_envs import UNIT
@@ -67,6 +67,12 @@ class ResumableWalkEnv(WalkEnv):
         self.np_random.bit_generator.state = state["generator"]
 
 
+class SmallChunks(ResumableCheckpoint):
+    """Checkpoints with more than one file of transitions."""
+
+    chunk_bytes = 1000
+
+
 def make_env(n_envs, folder=None, env_class=ResumableWalkEnv, normalize=False, vec_env_class=DummyVecEnv, seed=3):
     def make(i):
         file = None if folder is None else str(folder / str(i))
@@ -75,6 +81,16 @@ def make_env(n_envs, folder=None, env_class=ResumableWalkEnv, normalize=False, v
     env = vec_env_class([lambda i=i: make(i) for i in range(n_envs)])
     env.seed(seed)
     return VecNormalize(env) if normalize else env
+
+
+def generations(folder):
+    """:return: folders of the checkpoints, the newest last"""
+    return sorted(folder.glob("*_steps"))
+
+
+def trained(folder, total=60, n_envs=1, save_freq=10, checkpoint=ResumableCheckpoint, **kwargs):
+    """:return: a model that was trained with checkpoints"""
+    return make_model(PATD3, make_env(n_envs), **kwargs).learn(total, checkpoint(save_freq, folder))
 
 
 # Algorithm, number of environments and settings: each setting that has a state of its own is on in one of them
@@ -94,11 +110,10 @@ RUNS = {
 }
 
 
-def train(folder, name):
+def train(folder, name, moments):
     """Train or go on: what is run again and again until it ends."""
     algorithm, n_envs = name.split("-")[0], int(name.split("-")[1])
     normalize = n_envs > 1
-    replay_store.CHUNK_BYTES = 1000
     env = make_env(n_envs, folder / "monitor", normalize=normalize)
     eval_env = make_env(1, normalize=normalize, seed=77)
     kwargs = dict(RUNS[name])
@@ -116,11 +131,12 @@ def train(folder, name):
     model.set_logger(configure(str(folder / "log"), ["csv", "json"]))
     callbacks = [
         EvalCallback(eval_env, eval_freq=EVAL_FREQ, n_eval_episodes=2, log_path=str(folder), verbose=0),
-        ResumableCheckpoint(SAVE_STEPS // n_envs, folder / "checkpoints"),
+        SmallChunks(SAVE_STEPS // n_envs, folder / "checkpoints"),
+        moments.callback(),
     ]
     log_interval = 2 if algorithm == "HPPO" else 4
     model.learn(TOTAL - model.num_timesteps, callbacks, log_interval=log_interval, reset_num_timesteps=False)
-    return model, resumed_at
+    return model, env, resumed_at
 
 
 def _rows(path):
@@ -135,7 +151,7 @@ def _rows(path):
     return [{k: v for k, v in row.items() if k not in ("t", "time/fps", "time/time_elapsed")} for row in rows]
 
 
-def result(model, folder):
+def result(model, env, folder):
     """Everything that two equal runs have in common, as checksums by name."""
     parts = {}
 
@@ -151,10 +167,12 @@ def result(model, folder):
             parts[name] = hashlib.sha256(content + str(array.dtype).encode()).hexdigest()[:16]
 
     add("parameters", model.get_parameters())
-    if model.__dict__.get("replay_buffer") is not None:
-        add("buffer", {k: v for k, v in vars(model.replay_buffer).items() if isinstance(v, (np.ndarray, int, float, bool))})
+    buffer = getattr(model, "replay_buffer", None)
+    if buffer is not None:
+        public = {name: getattr(buffer, name) for name in dir(buffer) if not name.startswith("_")}
+        add("buffer", {k: v for k, v in public.items() if isinstance(v, (np.ndarray, int, float, bool))})
     add("num_timesteps", model.num_timesteps)
-    add("last_obs", model._last_obs)
+    add("environments", env.env_method("get_state"))
     add("generators", [th.get_rng_state(), np.random.get_state()[1], str(model.action_space.np_random.bit_generator.state)])
     for path in sorted([*(folder / "monitor").glob("*.csv"), *(folder / "log").iterdir()]):
         for i, row in enumerate(_rows(path)):
@@ -167,42 +185,44 @@ def result(model, folder):
 
 class Moments:
     """
-    Counts steps and writes, and kills the process at one of them.
+    Counts steps and what is done to files of checkpoints, and kills the process at one of these moments.
 
+    A file that is opened to be written holds something else than it should when the process is killed.
+
+    :param folder: of the checkpoints
     :param kill_at: number of the moment, None to count only
     """
 
-    def __init__(self, kill_at):
-        self.kill_at, self.n = kill_at, 0
-        self._hook(ResumableCheckpoint, "_on_step")
-        self._hook(checkpoint_store.GenerationWriter, "link")
-        self._hook(checkpoint_store.os, "fsync")
-        self._hook(checkpoint_store.Path, "rename")
-        self._hook(checkpoint_store.shutil, "rmtree")
-        whole_write = checkpoint_store.GenerationWriter.write
+    EVENTS = ("open", "os.link", "os.mkdir", "os.remove", "os.rename", "os.rmdir", "shutil.rmtree")
 
-        def write(writer, name, content):
-            if self.kill_at == self.n + 1:
-                whole_write(writer, name, bytes(content)[: len(content) // 2])
-            self.pass_by()
-            whole_write(writer, name, content)
+    def __init__(self, folder, kill_at):
+        self.folder, self.kill_at, self.n = str(folder), kill_at, 0
+        sys.addaudithook(self._hear)
 
-        checkpoint_store.GenerationWriter.write = write
+    def _hear(self, event, args):
+        # shutil.rmtree names files relative to their folder
+        if event not in self.EVENTS or not (str(args[0]).startswith(self.folder) or event in ("os.remove", "os.rmdir")):
+            return
+        if self.n + 1 == self.kill_at and event == "open" and "w" in str(args[1]):
+            self.kill_at = None
+            Path(args[0]).write_bytes(b"half of")
+            self.kill_at = self.n + 1
+        self.pass_by()
 
     def pass_by(self):
         self.n += 1
         if self.n == self.kill_at:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    def _hook(self, owner, name):
-        function = getattr(owner, name)
+    def callback(self):
+        moments = self
 
-        def hooked(*args, **kwargs):
-            self.pass_by()
-            answer = function(*args, **kwargs)
-            return answer
+        class Steps(BaseCallback):
+            def _on_step(self):
+                moments.pass_by()
+                return True
 
-        setattr(owner, name, hooked)
+        return Steps()
 
 
 def main(folder, kill_at, name):
@@ -210,9 +230,9 @@ def main(folder, kill_at, name):
     th.set_num_threads(1)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    moments = Moments(kill_at)
-    model, resumed_at = train(folder, name)
-    outcome = {"result": result(model, folder), "n_moments": moments.n, "resumed_at": resumed_at}
+    moments = Moments(folder / "checkpoints", kill_at)
+    model, env, resumed_at = train(folder, name, moments)
+    outcome = {"result": result(model, env, folder), "n_moments": moments.n, "resumed_at": resumed_at}
     (folder / "outcome.json").write_text(json.dumps(outcome))
 
 

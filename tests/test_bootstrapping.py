@@ -4,7 +4,7 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3, PDQNTD3
+from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3, PDQNTD3, HyARTD3
 from tests.hybrid_envs import HybridChainEnv
 
 TD3 = dict(gradient_steps=8, learning_rate=1e-3, learning_starts=400, policy_kwargs=dict(net_arch=[64, 64]))
@@ -13,13 +13,19 @@ SETTINGS = {
     PATD3: TD3,
     HHQNTD3: TD3,
     PDQNTD3: TD3,
+    # Its representation comes first, from random steps
+    HyARTD3: dict(
+        TD3, learning_starts=800, embedding_dim=3, parameter_latent_dim=2,
+        representation_warmup_steps=1500, representation_learning_rate=1e-3,
+    ),
     HPPO: dict(n_steps=64, batch_size=64, learning_rate=1e-3),
-}
+}  # fmt: skip
 
 
 def final_reward(algorithm, gamma):
     env = make_vec_env(HybridChainEnv, 8, seed=0)
-    model = algorithm("MlpPolicy", env, seed=0, gamma=gamma, **SETTINGS[algorithm]).learn(2000)
+    model = algorithm("MlpPolicy", env, seed=0, gamma=gamma, **SETTINGS[algorithm])
+    model.learn(4000 if algorithm is HyARTD3 else 2000)
     # Environment and policy are deterministic
     return evaluate_policy(model, make_vec_env(HybridChainEnv, 1), 1)[0]
 

@@ -8,7 +8,6 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chdp import CHDP
-from sb3_chdp.common import buffers
 from sb3_chdp.common.buffers import PRIORITY_EPSILON, PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
 from tests.algorithms import FAST_CHDP, filled_model
 from tests.hybrid_envs import HybridIdentityEnv, make_layout_env
@@ -37,20 +36,21 @@ def numbers(batch):
 
 
 @pytest.mark.parametrize("alpha, beta", [(0.6, 0.4), (1.0, 1.0), (0.0, 0.5)])
-@pytest.mark.parametrize("block", [buffers.BLOCK, 7, 8], ids="block {}".format)
-def test_frequencies_and_weights(alpha, beta, block, monkeypatch):
-    monkeypatch.setattr(buffers, "BLOCK", block)
-    buffer = filled_buffer(alpha=alpha, beta=beta)
-    errors = np.random.default_rng(0).normal(size=(10, 4)) ** 3
+@pytest.mark.parametrize("n_times", [10, 700], ids="{} time steps".format)
+def test_frequencies_and_weights(alpha, beta, n_times):
+    """Priorities are summed up in blocks: of a small buffer all at once, of a larger one in parts."""
+    buffer = filled_buffer(n_times, n_times, alpha=alpha, beta=beta)
+    errors = np.random.default_rng(0).normal(size=(n_times, 4)) ** 3
     set_errors(buffer, errors)
     expected = (np.abs(errors) + PRIORITY_EPSILON) ** alpha
     expected /= expected.sum()
     batch = buffer.sample(40_000)
     drawn = numbers(batch)
-    counts = np.array([[np.sum(drawn == 100 * t + e) for e in range(4)] for t in range(10)])
+    counts = np.zeros_like(expected)
+    np.add.at(counts, (drawn // 100, drawn % 100), 1)
     # Stratified: a transition is drawn as often as it should be, give or take the two strata that it shares
     assert np.abs(counts - 40_000 * expected).max() <= 3
-    weights = (40 * expected[drawn // 100, drawn % 100]) ** -beta
+    weights = (expected.size * expected[drawn // 100, drawn % 100]) ** -beta
     np.testing.assert_allclose(batch.weights.squeeze(1), weights / weights.max(), rtol=1e-4)
 
 

@@ -12,29 +12,37 @@ import pytest
 
 pytest.importorskip("rl_zoo3")
 
+from stable_baselines3.common.callbacks import BaseCallback
+
 from sb3_chdp.cli import prepare_arguments
-from sb3_chdp.common.resume import ResumableCheckpoint
 from sb3_chdp.zoo import register
 from sb3_chdp.zoo_resume import prepare_training
 
 # No preload: rl_zoo3 patches Gymnasium, for the processes of all tests
 PROCESSES = multiprocessing.get_context("forkserver")
-SETTINGS = "learning_starts:40 batch_size:8 n_envs:2 policy_kwargs:dict(net_arch=[8]) buffer_size:200"
+SETTINGS = (
+    "learning_starts:40 batch_size:8 n_envs:2 policy_kwargs:dict(net_arch=[8]) buffer_size:200 "
+    "callback:'tests.test_zoo_resume.Killer'"
+)
+# Environment variable with the number of steps after which a training is killed
+KILL_AT = "TESTS_KILL_AT"
 ARGUMENTS = (
     f"--algo pa_td3 --env Platform-v0 -n 240 --save-freq 40 --eval-freq 60 --eval-episodes 2 --verbose 0 -params {SETTINGS}"
 )
 
 
+class Killer(BaseCallback):
+    """Kills its process when so many steps have been made."""
+
+    def _on_step(self):
+        if str(self.num_timesteps) == os.environ.get(KILL_AT):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return True
+
+
 def train(arguments, kill_at=None):
     """rl_zoo3's script, killed when so many steps have been made."""
-    on_step = ResumableCheckpoint._on_step
-
-    def step_or_die(self):
-        if self.num_timesteps == kill_at:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return on_step(self)
-
-    ResumableCheckpoint._on_step = step_or_die
+    os.environ[KILL_AT] = str(kill_at)
     register()
     sys.argv = ["train", *prepare_training(arguments)]
     runpy.run_module("rl_zoo3.train", run_name="__main__", alter_sys=True)

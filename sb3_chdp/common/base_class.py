@@ -29,7 +29,7 @@ from sb3_chdp.common.arguments import (
     optional,
     whole,
 )
-from sb3_chdp.common.checks import check_policy_kwargs
+from sb3_chdp.common.checks import check_observation_space, check_policy_kwargs
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.masks import env_masks
 from sb3_chdp.common.native_env import NativeActionVecEnv
@@ -74,6 +74,9 @@ class HybridAlgorithm(BaseAlgorithm):
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        # SB3 converts the spaces of the old gym
+        if isinstance(env.observation_space, spaces.Space):
+            check_observation_space(env.observation_space)
         vec_env = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
         if is_vecenv_wrapped(vec_env, VecCheckNan):
             raise ValueError(

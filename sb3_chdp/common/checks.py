@@ -4,8 +4,14 @@ from collections.abc import Collection
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
 from sb3_chdp.common.arguments import FRACTION, check, constructor_defaults, one_of, whole
+from sb3_chdp.common.space_tree import leaves_of
+
+# What gymnasium.wrappers.FlattenObservation makes a vector of
+FLATTENABLE = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Text, spaces.OneOf)
+
 
 # Numbers that are learnt from: a thousand of them add up to 1e18, whose square float32 still holds. Losses and optimizers
 # compute such squares; beyond them they put out infinity, or learn nothing
@@ -62,6 +68,29 @@ def check_numbers(name: str, value: Any, first_env: int = 0) -> None:
         raise ValueError(
             f"{name} must be finite and between {-LARGEST:.0e} and {LARGEST:.0e}, got NaN, inf or more from environment(s) "
             f"{(first_env + bad).tolist()}: {value[bad]}"
+        )
+
+
+def check_observation_space(space: spaces.Space[Any]) -> None:
+    """
+    :param space: the observation space of an environment
+    :raises ValueError: if SB3's policies cannot read its observations; the message says how they can
+    """
+    parts = {f"observation_space[{key!r}]": part for key, part in space.items()} if isinstance(space, spaces.Dict) else None
+    for name, part in (parts or {"observation_space": space}).items():
+        is_flat = isinstance(part, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary))
+        starts_elsewhere = np.any(getattr(part, "start", 0))
+        if is_flat and not starts_elsewhere and not (isinstance(part, spaces.MultiDiscrete) and len(part.shape) > 1):
+            continue
+        remedy = (
+            "flatten the observations to one vector with gymnasium.wrappers.FlattenObservation(env)"
+            if all(isinstance(leaf, FLATTENABLE) for _, leaf in leaves_of(space))
+            else "give the observations a fixed size, for example by padding them to a Box"
+        )
+        what = f"{part}" if starts_elsewhere else f"a {type(part).__name__}"
+        raise ValueError(
+            f"{name} is {what}, but SB3's policies read Box, Discrete, MultiDiscrete (of one dimension) and MultiBinary, the "
+            f"discrete ones from 0 on, and a Dict of these; {remedy}"
         )
 
 

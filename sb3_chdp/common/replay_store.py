@@ -15,7 +15,6 @@ from sb3_chdp.common.plain_data import is_plain, is_setting, state_of
 
 # Arrays that get one row per time step and keep it; all others are written as a whole
 ROW_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-CHUNK_BYTES = 4 * 2**20
 
 
 class Written(NamedTuple):
@@ -60,9 +59,12 @@ class ReplayStore:
 
     Chunks without new rows are taken over from the generation before the last one, which is about to go: the two that are
     kept never share a file, and one survives what damages the other.
+
+    :param chunk_bytes: size of a file
     """
 
-    def __init__(self) -> None:
+    def __init__(self, chunk_bytes: int) -> None:
+        self.chunk_bytes = chunk_bytes
         #: rows added to the buffer since ``forget()``, to be counted by the owner
         self.n_added = 0
         self._buffer: ReplayBuffer | None = None
@@ -83,7 +85,7 @@ class ReplayStore:
             self._buffer = buffer
         arrays = row_arrays(buffer)
         row_bytes = sum(array[0].nbytes for array in arrays.values())
-        n_rows = max(1, CHUNK_BYTES // row_bytes)
+        n_rows = max(1, self.chunk_bytes // row_bytes)
         unchanged = self._unchanged(buffer, n_rows)
         for start in range(0, _filled(buffer), n_rows):
             name = f"replay/{start // n_rows:06d}.npy"

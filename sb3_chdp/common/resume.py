@@ -5,7 +5,7 @@ import tempfile
 import time
 import warnings
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -67,6 +67,9 @@ class ResumableCheckpoint(BaseCallback):
     :raises OSError: when learning starts, if the folder cannot be written to
     """
 
+    #: size of the files that hold the replay buffer; those without new transitions are not written again
+    chunk_bytes: ClassVar[int] = 4 * 2**20
+
     def __init__(self, save_freq: int, save_path: str | Path, verbose: int = 0):
         super().__init__(verbose)
         check_at_least(1, save_freq=save_freq)
@@ -75,7 +78,7 @@ class ResumableCheckpoint(BaseCallback):
         self._saved_at = 0  # number of calls
         self._n_rollouts = 0
         self._in_rollout = False
-        self._replay = ReplayStore()
+        self._replay = ReplayStore(self.chunk_bytes)
 
     def _init_callback(self) -> None:
         if self.parent is not None:

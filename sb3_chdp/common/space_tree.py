@@ -143,8 +143,9 @@ def collect_boxes(space: spaces.Space[Any], prefix: Path, name: str | None = Non
             raise ValueError(f"{leaf_name} has dtype {leaf.dtype}; use a floating or integer Box")
         if not (np.isfinite(leaf.low).all() and np.isfinite(leaf.high).all()):
             raise ValueError(
-                f"{leaf_name} is unbounded or has NaN bounds ({leaf}); give it finite bounds, "
-                "for example with gymnasium.wrappers.TransformAction"
+                f"{leaf_name} is unbounded or has NaN bounds ({leaf}); give it finite bounds, in the environment or with "
+                "gymnasium.wrappers.TransformAction(env, lambda action: action, space), where space is the action space with "
+                "a bounded Box in this place"
             )
         size = int(np.prod(leaf.shape))
         boxes.append(BoxLeaf(path, leaf, slice(offset, offset + size)))

@@ -1,0 +1,49 @@
+"""The scripts in examples run as the documentation says, wherever their packages are installed."""
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FOLDER = ROOT / "examples"
+# Script to the package that it needs
+PACKAGES = {"sliding": None, "shoot": "hybrid_shoot", "uav": "pyRDDLGym", "rover": "pyRDDLGym", "cogen": "sustaingym"}
+HELPERS = {"compare", "sliding_env"}
+RETURNS = ("random actions", "simple rule", "before training", "after training")
+
+
+def test_every_script_is_tested_and_documented():
+    assert {path.stem for path in FOLDER.glob("*.py")} == set(PACKAGES) | HELPERS
+    rows = re.findall(r"^\| (\w+) \|", (ROOT / "docs" / "examples.md").read_text(), flags=re.MULTILINE)
+    assert set(PACKAGES) <= set(rows)
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_a_few_steps(name, tmp_path):
+    package = PACKAGES[name]
+    if package is not None and importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package} is not installed")
+    command = [sys.executable, str(FOLDER / f"{name}.py"), "--steps", "150", "--episodes", "1"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, text=True, capture_output=True)
+    assert done.returncode == 0, done.stderr
+    printed = dict(re.findall(r"^(\D+?) +(\S+)$", done.stdout, flags=re.MULTILINE))
+    assert all(np.isfinite(float(printed[what])) for what in RETURNS)
+
+
+def test_the_table_is_filled_row_by_row(tmp_path):
+    specification = importlib.util.spec_from_file_location("compare", FOLDER / "compare.py")
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    page = tmp_path / "page.md"
+    page.write_text("| a | 1 | 2 |\n| b | 3 | 4 |\n")
+    module.write_row(page, "a", "5 | 6")
+    assert page.read_text() == "| a | 5 | 6 |\n| b | 3 | 4 |\n"
+    with pytest.raises(ValueError, match="begins with 'c'"):
+        module.write_row(page, "c", "7 | 8")
