@@ -126,7 +126,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         learning_starts: int = 500,
         batch_size: int = 128,
         tau: float = 0.005,
-        gamma: float = 0.99,
+        gamma: float = 0.97,
         train_freq: int | tuple[int, str] = 1,
         gradient_steps: int = 1,
         action_noise: ActionNoise | None = None,

@@ -58,7 +58,8 @@ class BilinearReads(nn.Module):
 
 class QNetwork(nn.Module):
     """
-    Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a.
+    Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a, with layer normalisation, which bounds Q where there
+    is no data (Ball et al., 2023).
 
     A sees polynomials of the parameters, bilinear reads of all by the latent, and the products of all entries of the latent
     with all parameters: what a parameter does depends on the discrete action, often by a factor. V and A are not told apart
@@ -82,12 +83,13 @@ class QNetwork(nn.Module):
         n_reads: int,
     ):
         super().__init__()
+        normalize: list[type[nn.Module]] = [nn.LayerNorm]
         n_inputs = features_dim + n_parameters * PARAMETER_DEGREE
         self.reads = BilinearReads(n_inputs, latent_dim, n_reads)
         value_arch = [width // 2 for width in net_arch[:1]]
-        self.value = nn.Sequential(*create_mlp(features_dim, 1, value_arch, activation_fn))
+        self.value = nn.Sequential(*create_mlp(features_dim, 1, value_arch, activation_fn, post_linear_modules=normalize))
         n_inputs += latent_dim + n_reads + latent_dim * n_parameters
-        self.advantage = nn.Sequential(*create_mlp(n_inputs, 1, net_arch, activation_fn))
+        self.advantage = nn.Sequential(*create_mlp(n_inputs, 1, net_arch, activation_fn, post_linear_modules=normalize))
 
     def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
         """:return: (B, 1) values"""
