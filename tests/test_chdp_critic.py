@@ -88,5 +88,5 @@ def test_value_of_the_state_and_advantages_add_up():
 def test_rescaled_values():
     q_network, inputs = make_q_network(), (th.randn(9, N_FEATURES), th.rand(9, LATENT_DIM), th.rand(9, 1))
     before = q_network(*inputs)
-    q_network.rescale(0.01)
-    th.testing.assert_close(q_network(*inputs), 0.01 * before)
+    q_network.rescale(0.01, 5.0)
+    th.testing.assert_close(q_network(*inputs), 0.01 * before + 5)

@@ -128,7 +128,6 @@ def test_parameters_with_which_latents_are_valued(parameters):
     th.manual_seed(0)
     losses.discrete_policy_loss(model.policy, data, features, stored)
     th.manual_seed(0)
-    actor.discrete_policy.diffusion_loss(data.latents, features)
     latents, k = actor.sample_latents(features)
     expected = data.parameters if parameters == "stored" else actor.sample_parameters(features, k)
     ((_, seen_latents, seen_parameters),) = calls
@@ -179,7 +178,7 @@ def test_alpha_normalises_by_q():
     """The discrete loss is L_d - eta / mean|Q| * mean Q: however large the values of the critic are."""
     model = filled_model(learning_rate=0.0, policy_delay=1)
     for critic in (model.critic, model.critic_target):
-        critic.rescale(1000)
+        critic.rescale(1000, 0)
     model.train(1, 64)
     logged = model.logger.name_to_value
     improvement = logged["train/discrete_loss"] - logged["train/diffusion_loss_discrete"]

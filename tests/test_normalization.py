@@ -7,7 +7,12 @@ from gymnasium import spaces
 from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_chdp import CHDP
-from sb3_chdp.common.normalization import NormalizedCombinedExtractor, NormalizedExtractor, RunningNormalization
+from sb3_chdp.common.normalization import (
+    WHITENED_GAIN,
+    NormalizedCombinedExtractor,
+    NormalizedExtractor,
+    RunningNormalization,
+)
 from tests.algorithms import fast_model
 from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, layouts
 
@@ -36,16 +41,21 @@ def split(features):
     return features[:, :N], features[:, N:]
 
 
-def test_zero_mean_unit_variance_and_whitened():
+def test_centered_scaled_and_whitened():
     x = batches() * th.tensor([1, 5, 0.1, 30, 1, 2]) + th.tensor([3, 0, 1, -40, 0, 1])
-    features = trained(x)(x[:100].flatten(0, 1).float())
-    assert features.shape[1] == NormalizedExtractor(box(-1, 1, N)).features_dim == 2 * N
-    normalized, whitened = split(features)
-    for part in (normalized, whitened):
+    x = x[:100].flatten(0, 1).float()
+    extractor = trained(batches() * th.tensor([1, 5, 0.1, 30, 1, 2]) + th.tensor([3, 0, 1, -40, 0, 1]))
+    features = extractor(x)
+    assert features.shape[1] == extractor.features_dim == 2 * N
+    scaled, whitened = split(features)
+    for part in (scaled, whitened):
         assert part.mean(dim=0).numpy() == pytest.approx(0, abs=0.1)
-    assert normalized.std(dim=0).numpy() == pytest.approx(1, abs=0.1)
-    assert (th.cov(normalized.T) - th.eye(N)).abs().max() > 0.8, "the test is of correlated entries"
-    assert (th.cov(whitened.T) - th.eye(N)).abs().max() < 0.15
+    # One factor for all entries
+    ratios = (scaled.std(dim=0) / x.std(dim=0)).numpy()
+    assert ratios == pytest.approx(ratios[0], rel=0.02)
+    assert scaled.var(dim=0).mean().item() == pytest.approx(1, abs=0.05)
+    assert (th.corrcoef(scaled.T) - th.eye(N)).abs().max() > 0.8, "the test is of correlated entries"
+    assert (th.cov(whitened.T) / WHITENED_GAIN**2 - th.eye(N)).abs().max() < 0.15
 
 
 @UNITS
@@ -81,13 +91,14 @@ def test_a_batch_of_one_and_a_vector_of_one():
         assert th.isfinite(single(th.tensor([[value]]))).all()
 
 
-def test_long_vectors_are_normalised_only():
+def test_long_vectors_are_not_whitened():
     n = 2000
     extractor = NormalizedExtractor(box(-1, 1, n))
-    assert extractor.features_dim == n
-    x = 5 * th.randn(64, n) + 3
-    features = extractor(x)
-    assert features.mean(dim=0).abs().max() < 1e-3 and features.std(dim=0).numpy() == pytest.approx(1, abs=0.01)
+    assert extractor.features_dim == 2 * n
+    scaled, standardized = extractor(5 * th.randn(64, n) + 3).split(n, dim=1)
+    for part, spread in ((scaled, 1.0), (standardized, WHITENED_GAIN)):
+        assert part.mean(dim=0).abs().max() < 1e-3
+        assert part.std().item() == pytest.approx(spread, abs=0.02)
 
 
 def test_statistics_are_frozen_in_evaluation():
