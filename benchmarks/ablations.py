@@ -92,8 +92,8 @@ class DeterministicPolicies(CHDPPolicy):
 class OneHotPolicy(CHDPPolicy):
     """One-hot vectors in place of the codebook."""
 
-    def _make_codebook(self, n_discrete_actions: int, latent_dim: int) -> Codebook:
-        return OneHotCodebook(n_discrete_actions)
+    def _make_codebook(self) -> Codebook:
+        return OneHotCodebook(self.action_space.spec.n_discrete_actions)
 
 
 class WithoutDiffusion(CHDP):
@@ -106,6 +106,7 @@ class WithoutCodebook(CHDP):
     """Latents of width K, decoded by arg max; the continuous policy is conditioned on a one-hot vector."""
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": OneHotPolicy}
+    takes_factored = False
 
     def _make_hybrid_space(self) -> HybridBox:
         n_discrete_actions = HybridBox(self.action_space, self.action_layout).spec.n_discrete_actions

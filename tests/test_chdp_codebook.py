@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_chdp import CHDP
-from sb3_chdp.chdp.codebook import Codebook, codebook_usage
+from sb3_chdp.chdp.codebook import Codebook
 from tests.algorithms import fast_model, filled_model
 from tests.hybrid_envs import LayoutEnv, box
 
@@ -35,9 +35,10 @@ def test_nearest_codeword_against_brute_force(k, dim, seed):
 
 
 def test_usage():
-    usage, perplexity = codebook_usage(th.tensor([0, 0, 3, 3]), 8)
+    codebook = Codebook(8, 2)
+    usage, perplexity = codebook.usage(th.tensor([0, 0, 3, 3]))
     assert usage == 0.25 and perplexity == pytest.approx(2)
-    assert codebook_usage(th.tensor([5]), 8)[1] == pytest.approx(1)
+    assert codebook.usage(th.tensor([5]))[1] == pytest.approx(1)
 
 
 def test_codebook_stays_where_the_latents_are():

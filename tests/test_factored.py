@@ -10,7 +10,8 @@ from sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_m
 from stable_baselines3.common.env_util import make_vec_env
 from torch.distributions import Categorical, Normal
 
-from sb3_chdp import HHQNTD3, HPPO, PATD3, PDQNTD3, FlattenHybridAction, HyARTD3, HybridActionSpec, check_hybrid_env
+from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3, PDQNTD3, FlattenHybridAction, HyARTD3, HybridActionSpec, check_hybrid_env
+from sb3_chdp.chdp import PaperCHDP
 from sb3_chdp.common import off_policy_algorithm
 from sb3_chdp.common.distributions import HybridDistribution
 from sb3_chdp.common.evaluation import evaluate_policy
@@ -21,7 +22,7 @@ from sb3_chdp.hyar_td3.representation import ActionBatch, FactoredActionRepresen
 from tests.algorithms import has_learnt, make_model, snapshot
 from tests.hybrid_envs import LayoutEnv, box
 
-CLASSES = [HPPO, PATD3, HHQNTD3, HyARTD3]
+CLASSES = [CHDP, PaperCHDP, HPPO, PATD3, HHQNTD3, HyARTD3]
 # 2^76 * 5 * 3 * 4 joint actions
 HUGE = spaces.Dict(
     {"a": spaces.MultiDiscrete([3, 4]), "b": spaces.MultiBinary(76), "c": spaces.Discrete(5, start=-2), "x": box(-1, 3, 2)}
@@ -139,7 +140,9 @@ def test_two_choices_equal_their_joint_index_under_masks(algorithm):
 
 
 def test_an_algorithm_that_needs_one_index():
-    with pytest.raises(ValueError, match=r"PDQNTD3 needs one index for all of the .*: use HPPO, PATD3, HHQNTD3 or HyARTD3"):
+    with pytest.raises(
+        ValueError, match=r"PDQNTD3 needs one index for all of the .*: use CHDP, HPPO, PATD3, HHQNTD3 or HyARTD3"
+    ):
         make_model(PDQNTD3, LayoutEnv(bits_space(20)))
     with pytest.raises(ValueError, match="PDQNTD3 needs one index"):
         make_model(PDQNTD3, LayoutEnv(bits_space(3)), action_layout="factored")
@@ -147,7 +150,7 @@ def test_an_algorithm_that_needs_one_index():
     assert model.hybrid_space.spec.radices == (2048,) and model.action_layout == "auto"
 
 
-@pytest.mark.parametrize("algorithm", CLASSES[1:])
+@pytest.mark.parametrize("algorithm", [algorithm for algorithm in CLASSES if algorithm is not HPPO])
 def test_buffers_grow_with_the_sum_of_the_radices(algorithm):
     widths = [make_model(algorithm, LayoutEnv(bits_space(n))).replay_buffer.action_dim for n in (20, 40)]
     assert widths[1] - widths[0] <= 40

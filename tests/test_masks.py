@@ -12,21 +12,15 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy as evaluate_free_policy
 
 from sb3_chdp import ALGORITHMS as REGISTRY
-from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3, PDQNTD3, HyARTD3, HybridActionSpec
+from sb3_chdp import HHQNTD3, HPPO, PATD3, PDQNTD3, HyARTD3, HybridActionSpec
 from sb3_chdp.common.evaluation import evaluate_policy
 from sb3_chdp.common.masks import read_masks
 from sb3_chdp.common.utils import nearest_row
 from tests.algorithms import has_learnt, make_model, snapshot
 from tests.hybrid_envs import FewValidEnv, MaskedEnv, box, layouts, make_layout_env
 
-# To be removed as soon as CHDP takes masks
-NOT_YET = pytest.mark.xfail(strict=True, raises=TypeError, reason="CHDP does not take masks")
-CLASSES = [
-    pytest.param(line.load_class(), id=name, marks=[NOT_YET] if issubclass(line.load_class(), CHDP) else [])
-    for name, line in REGISTRY.items()
-]
-OBEDIENT = [HPPO, PATD3, HHQNTD3, PDQNTD3, HyARTD3]
-OFF_POLICY = OBEDIENT[1:]
+CLASSES = [pytest.param(line.load_class(), id=name) for name, line in REGISTRY.items()]
+TD3_BASED = [PATD3, HHQNTD3, PDQNTD3, HyARTD3]
 
 
 @pytest.mark.parametrize("algorithm", CLASSES)
@@ -69,7 +63,7 @@ def test_predictions(algorithm, tmp_path):
     loaded.learn(60)
 
 
-@pytest.mark.parametrize("algorithm", OBEDIENT)
+@pytest.mark.parametrize("algorithm", CLASSES)
 def test_masks_can_be_ignored_and_must_be_there(algorithm):
     assert not make_model(algorithm, MaskedEnv(), use_masking=False).use_masking
     assert not make_model(algorithm, make_layout_env()).use_masking
@@ -77,7 +71,7 @@ def test_masks_can_be_ignored_and_must_be_there(algorithm):
         make_model(algorithm, make_layout_env(), use_masking=True).learn(10)
 
 
-@pytest.mark.parametrize("algorithm", OBEDIENT)
+@pytest.mark.parametrize("algorithm", CLASSES)
 def test_an_environment_that_allows_nothing(algorithm):
     class StuckEnv(MaskedEnv):
         def _draw(self):
@@ -108,7 +102,7 @@ def test_buffers_hold_the_masks_of_both_states(n_steps, explicit, tells_last):
     assert data.next_masks.any(dim=1).all()
 
 
-@pytest.mark.parametrize("algorithm", OFF_POLICY)
+@pytest.mark.parametrize("algorithm", TD3_BASED)
 def test_targets_and_improvement_are_of_allowed_actions(algorithm):
     """What the critics of other actions say makes no difference."""
     model = make_model(algorithm, make_vec_env(MaskedEnv, 2), target_policy_noise=0.0).learn(100)

@@ -4,7 +4,7 @@ import pytest
 import torch as th
 
 from sb3_chdp.chdp.codebook import Codebook
-from sb3_chdp.chdp.product_codebook import ProductCodebook, choice_usage
+from sb3_chdp.chdp.product_codebook import ProductCodebook
 from sb3_chdp.common.product_table import block_widths, random_values
 
 RADICES = (3, 2, 5, 1)
@@ -92,5 +92,5 @@ def test_random_values_are_uniform_over_what_masks_allow():
 
 def test_usage_is_a_mean_over_the_choices():
     k = th.tensor([[0, 0], [1, 0], [0, 0], [1, 0]])
-    usage, perplexity = choice_usage(k, (2, 4))
+    usage, perplexity = ProductCodebook((2, 4), 3).usage(k)
     assert usage == pytest.approx((1 + 0.25) / 2) and perplexity == pytest.approx((2 + 1) / 2)

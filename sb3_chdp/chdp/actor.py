@@ -6,6 +6,7 @@ from torch import nn
 from sb3_chdp.chdp.codebook import Codebook
 from sb3_chdp.chdp.critic import BilinearReads
 from sb3_chdp.chdp.diffusion import DiffusionModel
+from sb3_chdp.chdp.product_codebook import ProductCodebook
 from sb3_chdp.common.hybrid_box import HybridBox
 
 
@@ -14,7 +15,8 @@ class CooperativeActor(nn.Module):
     The two agents of the cooperative game.
 
     The discrete policy draws a latent e, the codebook decodes it to k and e_k, and the continuous policy, conditioned on
-    the state and e_k, draws the parameters.
+    the state and e_k, draws the parameters. In a factored space k is (B, L) where (B,) is said, and masks are (B, sum of the
+    radices).
 
     :param action_space: space of the action rows
     :param codebook: quantises the latents
@@ -28,7 +30,7 @@ class CooperativeActor(nn.Module):
     def __init__(
         self,
         action_space: HybridBox,
-        codebook: Codebook,
+        codebook: Codebook | ProductCodebook,
         discrete_policy: DiffusionModel,
         continuous_policy: DiffusionModel,
         reads: BilinearReads | None = None,
@@ -48,7 +50,7 @@ class CooperativeActor(nn.Module):
     @property
     def device(self) -> th.device:
         """Where the networks are"""
-        return self.codebook.codewords.device
+        return self.parameter_mask.device
 
     def mask(self, k: th.Tensor) -> th.Tensor | None:
         """:return: (B, Pmax) 1 for the parameters that action k has, None if no action has padding"""
@@ -67,8 +69,8 @@ class CooperativeActor(nn.Module):
         latents = self.discrete_policy.sample(features, noise=noise)
         k = self.codebook.quantize(latents, masks)
         if masks is not None:
-            allowed = self.codebook.quantize(latents) == k
-            latents = th.where(allowed[:, None], latents, self.codebook.representative_latents(k))
+            strayed = self.codebook.strayed(latents, k)
+            latents = th.where(strayed, self.codebook.representative_latents(k), latents)
         return latents, k
 
     def condition(self, features: th.Tensor, codewords: th.Tensor) -> th.Tensor:
@@ -99,7 +101,7 @@ class CooperativeActor(nn.Module):
         :return: codewords as latents (*shape, latent_dim), discrete actions (*shape), parameters (*shape, Pmax), padding 0
         """
         device = self.device if generator is None else "cpu"
-        k = th.randint(self.codebook.n_discrete_actions, shape, generator=generator, device=device).to(self.device)
+        k = self.codebook.random(*shape, generator=generator)
         parameters = 2 * th.rand(*shape, self.continuous_policy.dim, generator=generator, device=device).to(self.device) - 1
         mask = self.mask(k)
         return self.codebook.representative_latents(k), k, parameters if mask is None else parameters * mask

@@ -17,7 +17,7 @@ class SelectedActions(NamedTuple):
     A hybrid action for each of B observations.
 
     :ivar latents: (B, latent_dim)
-    :ivar discrete_actions: (B,)
+    :ivar discrete_actions: (B,), (B, L) of a factored space
     :ivar parameters: (B, Pmax), padding 0
     :ivar q_values: (B, 1) their min(Q1, Q2)
     """
@@ -33,7 +33,7 @@ class Candidates(NamedTuple):
     n hybrid actions for each of B observations.
 
     :ivar latents: (B, n, latent_dim)
-    :ivar discrete_actions: (B, n)
+    :ivar discrete_actions: (B, n), (B, n, L) of a factored space
     :ivar parameters: (B, n, Pmax), padding 0
     """
 
@@ -46,19 +46,19 @@ class Candidates(NamedTuple):
         batch_size = len(self.latents)
         return Candidates(*(th.cat([a, b.expand(batch_size, *b.shape[1:])], dim=1) for a, b in zip(self, others, strict=True)))
 
-    def best(self, critic: HybridCritic, features: th.Tensor, masks: th.Tensor | None = None) -> SelectedActions:
+    def best(self, critic: HybridCritic, features: th.Tensor, allowed: th.Tensor | None = None) -> SelectedActions:
         """
         :param critic: twin critic
         :param features: (B, features_dim) features of the observations
-        :param masks: (B, K) False for discrete actions that may not be taken, None if all may
+        :param allowed: (B, n) which candidates may be taken, None: all
         :return: the candidates of highest min(Q1, Q2) among those that may be taken
         """
-        batch_size, n = self.discrete_actions.shape
+        batch_size, n = self.latents.shape[:2]
         latents, k, parameters = (part.flatten(0, 1) for part in self)
         q_values = th.min(*critic.q_values(features.repeat_interleave(n, dim=0), latents, parameters))
         values = q_values.view(batch_size, n)
-        if masks is not None:
-            values = values.masked_fill(~masks.gather(1, self.discrete_actions), -th.inf)
+        if allowed is not None:
+            values = values.masked_fill(~allowed, -th.inf)
         best = values.argmax(dim=1) + th.arange(batch_size, device=features.device) * n
         return SelectedActions(latents[best], k[best], parameters[best], q_values[best])
 
@@ -77,23 +77,20 @@ def drawn_candidates(
     :param actor: the policies
     :param features: (B, features_dim) features of the observations
     :param n: number of actions per observation that both policies draw
-    :param n_uniform: number of further actions, of successive discrete actions from a random one on: each once if there are
-        no more
+    :param n_uniform: number of further discrete actions, see :meth:`Codebook.alternatives`
     :param noise: noises of the chains of latents (N, B * n, latent_dim) and of parameters (N, B * (n_uniform + n), Pmax);
         None: draw
     :param masks: (B, K) False for discrete actions that the discrete policy may not draw, None if it may draw all
     """
-    batch_size, codebook, device = len(features), actor.codebook, features.device
+    batch_size, codebook = len(features), actor.codebook
     latent_noise, parameter_noise = (None, None) if noise is None else noise
     masks = None if masks is None else masks.repeat_interleave(n, dim=0)
     latents, k = actor.sample_latents(features.repeat_interleave(n, dim=0), latent_noise, masks)
-    latents, k = latents.view(batch_size, n, -1), k.view(batch_size, n)
+    latents, k = latents.unflatten(0, (batch_size, n)), k.unflatten(0, (batch_size, n))
     if n_uniform > 0:
-        first = th.randint(codebook.n_discrete_actions, (batch_size, 1), device=device) if noise is None else 0
-        uniform_k = (first + th.arange(n_uniform, device=device)) % codebook.n_discrete_actions
-        uniform_k = uniform_k.expand(batch_size, n_uniform)
+        uniform_k = codebook.alternatives(k[:, 0], n_uniform, noise is not None)
         latents, k = th.cat([codebook.representative_latents(uniform_k), latents], dim=1), th.cat([uniform_k, k], dim=1)
-    parameters = actor.sample_parameters(features.repeat_interleave(n + n_uniform, dim=0), k.flatten(), parameter_noise)
+    parameters = actor.sample_parameters(features.repeat_interleave(n + n_uniform, dim=0), k.flatten(0, 1), parameter_noise)
     return Candidates(latents, k, parameters.view(batch_size, n + n_uniform, -1))
 
 
@@ -111,6 +108,23 @@ def random_candidates(actor: CooperativeActor, batch_size: int, n: int, repeatab
     return Candidates(*actor.random_actions(batch_size, n))
 
 
+def changed_candidates(actor: CooperativeActor, actions: SelectedActions, n: int, repeatable: bool) -> Candidates:
+    """
+    Actions, and n others of each with the same parameters and another discrete action.
+
+    :param actor: the policies, whose codewords are the latents
+    :param actions: actions of B observations
+    :param n: number of other discrete actions, see :meth:`ProductCodebook.alternatives`
+    :param repeatable: whether to return the same changes always
+    :return: candidates of B observations, the given action first, n + 1 in all
+    """
+    k = actor.codebook.alternatives(actions.discrete_actions, n, repeatable)
+    latents = actor.codebook.representative_latents(k)
+    parameters = actions.parameters[:, None].expand(-1, n, -1)
+    changed = Candidates(latents, k, parameters)
+    return Candidates(actions.latents[:, None], actions.discrete_actions[:, None], actions.parameters[:, None]).join(changed)
+
+
 def varied_candidates(actor: CooperativeActor, actions: SelectedActions, n: int, spread: float) -> Candidates:
     """
     Actions and n Gaussian variations of the parameters of each, always the same ones.
@@ -126,7 +140,9 @@ def varied_candidates(actor: CooperativeActor, actions: SelectedActions, n: int,
     mask = actor.mask(k)
     varied = (parameters[:, None] + spread * (noise if mask is None else noise * mask[:, None])).clamp(-1, 1)
     return Candidates(
-        latents[:, None].expand(-1, n + 1, -1), k[:, None].expand(-1, n + 1), th.cat([parameters[:, None], varied], dim=1)
+        latents[:, None].expand(-1, n + 1, -1),
+        k[:, None].expand(-1, n + 1, *k.shape[1:]),
+        th.cat([parameters[:, None], varied], dim=1),
     )
 
 
@@ -138,6 +154,8 @@ class Selection:
     :param n_drawn: number of actions per observation that both policies draw
     :param n_uniform: number of uniformly random discrete actions with parameters of the continuous policy
     :param n_random: number of uniformly random actions
+    :param n_changed: number of discrete actions that take the place of that of the best of all these, for spaces in which all
+        share their parameters
     :param n_refined: number of variations of the parameters of the best of all these, in each of two rounds with standard
         deviations of ``REFINEMENT_SPREADS`` of the scaled parameters
     """
@@ -145,6 +163,7 @@ class Selection:
     n_drawn: int
     n_uniform: int = 0
     n_random: int = 0
+    n_changed: int = 0
     n_refined: int = 0
 
     def __call__(
@@ -163,10 +182,17 @@ class Selection:
             then. None: draw
         :param masks: (B, K) False for discrete actions that may not be taken, None if all may
         """
+
+        def allowed(candidates: Candidates) -> th.Tensor | None:
+            return None if masks is None else actor.codebook.allowed(candidates.discrete_actions, masks)
+
         candidates = drawn_candidates(actor, features, self.n_drawn, self.n_uniform, noise, masks)
         if self.n_random > 0:
             candidates = candidates.join(random_candidates(actor, len(features), self.n_random, noise is not None))
-        best = candidates.best(critic, features, masks)
+        best = candidates.best(critic, features, allowed(candidates))
+        if self.n_changed > 0:
+            candidates = changed_candidates(actor, best, self.n_changed, noise is not None)
+            best = candidates.best(critic, features, allowed(candidates))
         for spread in REFINEMENT_SPREADS if self.n_refined > 0 else ():
             best = varied_candidates(actor, best, self.n_refined, spread).best(critic, features)
         return best

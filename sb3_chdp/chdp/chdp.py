@@ -12,7 +12,6 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import LinearSchedule, update_learning_rate
 
 from sb3_chdp.chdp.actor import CooperativeActor
-from sb3_chdp.chdp.codebook import codebook_usage
 from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.exploration import exploration_rate, vary_parts
 from sb3_chdp.chdp.losses import continuous_policy_loss, critic_loss, discrete_policy_loss, relabel_latents, target_values
@@ -21,7 +20,9 @@ from sb3_chdp.common.arguments import Accepted, number, of_networks, warn_of_cos
 from sb3_chdp.common.buffers import PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
+from sb3_chdp.common.product_table import block_widths
 from sb3_chdp.common.samples import HybridReplaySamples
+from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.common.utils import TargetUpdate, gradient_step
 
 # By default
@@ -71,14 +72,13 @@ class CHDP(HybridOffPolicyAlgorithm):
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer at a cost of more complexity.
     :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the critics.
-    :param latent_dim: width d_e of the latent and of a codeword
+    :param latent_dim: width d_e of the latent and of a codeword, at most that of one choice of a factored space
     :param n_diffusion_steps: number N of denoising steps of both policies
     :param eta: weight of the policy improvement terms relative to the diffusion losses
     :param codebook_lr_factor: learning rate of the codebook relative to that of the networks
     :param n_action_candidates: number of actions that both policies draw per observation to act, beside others that compete
     :param policy_delay: policies and targets are updated once every ``policy_delay`` critic updates
-    :param action_layout: how to read an ambiguous action space, "auto", "per_action" or "shared",
-        see :class:`HybridActionSpec`
+    :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
     :param use_masking: whether to ask the environment for ``action_masks()`` and to take no discrete action that they forbid;
         None: if it has such a method
     :param stats_window_size: number of episodes over which the logged success rate, length and reward are averaged
@@ -102,6 +102,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         "codebook_lr_factor": number(),
         "n_action_candidates": whole(1),
     }
+    takes_factored = True
     # Share of uniformly random discrete actions for which the continuous policy is improved
     uniform_fraction: ClassVar[float] = 0.5
     # Whether the critics' loss trains the codebook
@@ -186,10 +187,16 @@ class CHDP(HybridOffPolicyAlgorithm):
             self._setup_model()
 
     def _network_kwargs(self) -> dict[str, Any]:
-        return dict(n_diffusion_steps=self.n_diffusion_steps, n_action_candidates=self.n_action_candidates)
+        return dict(
+            latent_dim=self.latent_dim,
+            n_diffusion_steps=self.n_diffusion_steps,
+            n_action_candidates=self.n_action_candidates,
+        )
 
     def _make_hybrid_space(self) -> HybridBox:
-        return HybridBox(self.action_space, self.action_layout, self.latent_dim, self._mask_parts())
+        radices = HybridActionSpec(self.action_space, self.action_layout).radices
+        width = sum(block_widths(radices, self.latent_dim))
+        return HybridBox(self.action_space, self.action_layout, width, self._mask_parts())
 
     def _setup_model(self) -> None:
         if self.replay_buffer_class is None:
@@ -268,7 +275,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         for name, values in logs.items():
             self.logger.record(f"train/{name}", th.stack(values).mean().item())
         if "continuous_loss" in logs:
-            usage, perplexity = codebook_usage(k, self.hybrid_space.spec.n_discrete_actions)
+            usage, perplexity = self.actor.codebook.usage(k)
             self.logger.record("train/codebook_usage", usage)
             self.logger.record("train/codebook_perplexity", perplexity)
 
@@ -297,7 +304,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         return latents, k
 
     def _exploration_rate(self) -> float:
-        return exploration_rate(self.num_timesteps, self._episode_num, self.hybrid_space.spec.n_discrete_actions)
+        return exploration_rate(self.num_timesteps, self._episode_num, sum(self.hybrid_space.spec.radices))
 
     def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator, masks: np.ndarray | None = None) -> np.ndarray:
         assert self._last_obs is not None, "self._last_obs was not set"

@@ -38,20 +38,56 @@ class Codebook(nn.Module):
         """:return: (B, d_e) latents that stand for the discrete actions, their codewords"""
         return self.codewords.detach()[k]
 
+    def strayed(self, latents: th.Tensor, k: th.Tensor) -> th.Tensor:
+        """
+        :param latents: (B, d_e)
+        :param k: (B,) discrete actions
+        :return: (B, 1) which latents do not decode to k
+        """
+        return (self.quantize(latents) != k)[:, None]
+
+    def random(self, *shape: int, generator: th.Generator | None = None) -> th.Tensor:
+        """
+        :param shape: how many actions
+        :param generator: random generator on the CPU, the global one of the codebook's device if None
+        :return: (*shape) uniformly random discrete actions
+        """
+        device = self.codewords.device
+        where = device if generator is None else "cpu"
+        return th.randint(self.n_discrete_actions, shape, generator=generator, device=where).to(device)
+
+    def alternatives(self, k: th.Tensor, n: int, repeatable: bool) -> th.Tensor:
+        """
+        Other discrete actions to try.
+
+        :param k: (B,) discrete actions
+        :param n: number of alternatives to each, at most K
+        :param repeatable: whether to return the same ones always
+        :return: (B, n) successive discrete actions from a random one on, from 0 on if ``repeatable``
+        """
+        first = 0 if repeatable else th.randint(self.n_discrete_actions, (len(k), 1), device=k.device)
+        return ((first + th.arange(n, device=k.device)) % self.n_discrete_actions).expand(len(k), n)
+
+    def allowed(self, k: th.Tensor, masks: th.Tensor) -> th.Tensor:
+        """
+        :param k: (B, n) discrete actions
+        :param masks: (B, K) False for discrete actions that may not be taken
+        :return: (B, n) which of the discrete actions may be taken
+        """
+        return masks.gather(1, k)
+
+    def usage(self, k: th.Tensor) -> tuple[float, float]:
+        """
+        How many actions a batch uses.
+
+        :param k: (B,) discrete actions
+        :return: share of the K actions that occur, and perplexity of their frequencies: as many, if they were equally frequent
+        """
+        frequencies = th.unique(k, return_counts=True)[1] / len(k)
+        perplexity = (-(frequencies * frequencies.log()).sum()).exp()
+        return len(frequencies) / self.n_discrete_actions, perplexity.item()
+
     def project(self) -> None:
         """Move the codewords back into [-1, 1], where the latents are, after a gradient step."""
         with th.no_grad():
             self.codewords.clamp_(-1, 1)
-
-
-def codebook_usage(k: th.Tensor, n_discrete_actions: int) -> tuple[float, float]:
-    """
-    How many actions a batch uses.
-
-    :param k: (B,) discrete actions
-    :param n_discrete_actions: number K of codewords
-    :return: share of the K actions that occur, and perplexity of their frequencies: as many, if they were equally frequent
-    """
-    frequencies = th.unique(k, return_counts=True)[1] / len(k)
-    perplexity = (-(frequencies * frequencies.log()).sum()).exp()
-    return len(frequencies) / n_discrete_actions, perplexity.item()

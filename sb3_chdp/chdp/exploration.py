@@ -5,7 +5,7 @@ import torch as th
 
 from sb3_chdp.chdp.policies import CHDPPolicy
 
-# After so many steps, and some for each discrete action, every second action still explores
+# After so many steps, and some for each discrete action or value of a choice, every second action still explores
 HALF_LIFE, HALF_LIFE_PER_ACTION = 500, 5
 # Explored actions of an episode that always remain, unless that is more than a share of all
 ACTIONS_PER_EPISODE, MAX_FINAL_RATE = 1.0, 0.1
@@ -13,17 +13,17 @@ ACTIONS_PER_EPISODE, MAX_FINAL_RATE = 1.0, 0.1
 NOISE_SCALES = (0.03, 1.0)
 
 
-def exploration_rate(n_steps: int, n_episodes: int, n_discrete_actions: int) -> float:
+def exploration_rate(n_steps: int, n_episodes: int, n_values: int) -> float:
     """
     The rate falls with the number n of steps as n0 / (n0 + n), n0 = ``HALF_LIFE`` + K ``HALF_LIFE_PER_ACTION``, whatever the
     length of the training; ``ACTIONS_PER_EPISODE`` of an episode keep exploring.
 
     :param n_steps: steps so far
     :param n_episodes: episodes so far
-    :param n_discrete_actions: number K of discrete actions
+    :param n_values: number K of discrete actions, in a factored space sum of the radices
     :return: probability of an exploratory action
     """
-    half_life = HALF_LIFE + HALF_LIFE_PER_ACTION * n_discrete_actions
+    half_life = HALF_LIFE + HALF_LIFE_PER_ACTION * n_values
     final = min(ACTIONS_PER_EPISODE * n_episodes / max(n_steps, 1), MAX_FINAL_RATE)
     return max(half_life / (half_life + n_steps), final)
 
@@ -78,9 +78,9 @@ def vary_parts(
         k = th.as_tensor(columns.discrete_actions(random), device=policy.device)
         columns.view(of_random_k, "parameters")[:] = policy.actor.sample_parameters(features, k).cpu().numpy()
 
-    mask = spec.mask[columns.discrete_actions(rows)]
+    mask, mask_of_random = (spec.mask[spec.options_of(columns.discrete_actions(x))] for x in (rows, random))
     elsewhere, nearby = rows.copy(), rows.copy()
-    columns.view(random, "parameters")[:] = random_parameters(rng, spec.mask[columns.discrete_actions(random)])
+    columns.view(random, "parameters")[:] = random_parameters(rng, mask_of_random)
     columns.view(elsewhere, "parameters")[:] = random_parameters(rng, mask)
     low, high = np.log(NOISE_SCALES)
     scales = np.exp(rng.uniform(low, high, (n, 1)))

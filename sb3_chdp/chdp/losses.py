@@ -15,9 +15,9 @@ def relabel_latents(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> tup
     :return: the batch, and the share of its latents that did not decode to the stored action
     """
     codebook = policy.actor.codebook
-    drifted = codebook.quantize(replay_data.latents) != replay_data.discrete_actions
+    drifted = codebook.strayed(replay_data.latents, replay_data.discrete_actions)
     present = codebook.representative_latents(replay_data.discrete_actions)
-    latents = th.where(drifted[:, None], present, replay_data.latents)
+    latents = th.where(drifted, present, replay_data.latents)
     return replay_data._replace(latents=latents), drifted.float().mean()
 
 

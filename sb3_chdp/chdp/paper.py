@@ -59,12 +59,12 @@ class PaperPolicy(CHDPPolicy):
         spec, latent_dim = self.action_space.spec, self.action_space.latent_dim
         return CooperativeActor(
             self.action_space,
-            self._make_codebook(spec.n_discrete_actions, latent_dim),
+            self._make_codebook(),
             self._make_model(latent_dim, features_dim),
             self._make_model(spec.max_parameters, features_dim + latent_dim),
         )
 
-    def _make_selections(self, n_discrete_actions: int) -> tuple[Selection, Selection, Selection]:
+    def _make_selections(self) -> tuple[Selection, Selection, Selection]:
         one = Selection(n_drawn=1)
         return one, one, one
 
@@ -101,7 +101,7 @@ class PaperCHDP(CHDP):
     :param gradient_steps: How many gradient steps to do after each rollout
     :param replay_buffer_class: Replay buffer class to use. If ``None``, it will be automatically selected.
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
-    :param latent_dim: width d_e of the latent and of a codeword
+    :param latent_dim: width d_e of the latent and of a codeword, at most that of one choice of a factored space
     :param n_diffusion_steps: number N of denoising steps of both policies
     :param eta: weight of the policy improvement terms relative to the diffusion losses
     :param codebook_lr_factor: learning rate of the codebook relative to that of the networks
@@ -185,7 +185,7 @@ class PaperCHDP(CHDP):
         )
 
     def _latents_of_today(self, replay_data: HybridReplaySamples) -> tuple[HybridReplaySamples, th.Tensor]:
-        drifted = self.actor.codebook.quantize(replay_data.latents) != replay_data.discrete_actions
+        drifted = self.actor.codebook.strayed(replay_data.latents, replay_data.discrete_actions)
         return replay_data, drifted.float().mean()
 
     def _parameters_of_latents(self, replay_data: HybridReplaySamples) -> th.Tensor | None:

@@ -16,6 +16,7 @@ from sb3_chdp.chdp.candidates import Selection
 from sb3_chdp.chdp.codebook import Codebook
 from sb3_chdp.chdp.critic import BilinearReads, HybridCritic, QNetwork
 from sb3_chdp.chdp.diffusion import DiffusionModel
+from sb3_chdp.chdp.product_codebook import ProductCodebook
 from sb3_chdp.chdp.value_scale import ValueScale
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.normalization import NormalizedCombinedExtractor, NormalizedExtractor
@@ -29,8 +30,8 @@ N_READS = 8
 RANDOM_LATENT_NOISE = 0.1
 # Number of noise chains that repeatable draws choose from
 FIXED_NOISE_CHAINS = 1024
-# Discrete actions, all of them if there are no more, of which one set of parameters competes
-MAX_UNIFORM_CANDIDATES = 64
+# Discrete actions that compete beside those drawn, all of them if there are no more; in a factored space changes of one choice
+MAX_ALTERNATIVES = 64
 # Uniformly random actions that compete
 N_RANDOM_CANDIDATES = 64
 # Variations of the best action that compete in deterministic predictions
@@ -54,6 +55,7 @@ class CHDPPolicy(HybridPolicy):
     :param normalize_images: whether to divide images by 255
     :param optimizer_class: optimizer of all networks
     :param optimizer_kwargs: its keyword arguments, without the learning rate; ``fused=True`` for Adam if None
+    :param latent_dim: width of a codeword of one choice at most if the space is factored, that of :class:`CHDP`
     :param n_diffusion_steps: number N of denoising steps, that of :class:`CHDP`
     :param n_action_candidates: number of actions drawn per observation, that of :class:`CHDP`
     """
@@ -76,6 +78,7 @@ class CHDPPolicy(HybridPolicy):
         normalize_images: bool = True,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
+        latent_dim: int = 32,
         n_diffusion_steps: int = 5,
         n_action_candidates: int = 8,
     ):
@@ -93,12 +96,12 @@ class CHDPPolicy(HybridPolicy):
         )
         self.net_arch = {"pi": [128, 128], "qf": [256, 256]} if net_arch is None else net_arch
         self.activation_fn = activation_fn
+        self.latent_dim = latent_dim
         self.n_diffusion_steps = n_diffusion_steps
         self.n_action_candidates = n_action_candidates
         self._build(lr_schedule)
 
     def _build(self, lr_schedule: Schedule) -> None:
-        spec: HybridActionSpec = self.action_space.spec
         extractor = self.make_features_extractor()
         self.critic = self._make_critic(extractor)
         self.actor = self._make_actor(extractor.features_dim)
@@ -107,7 +110,7 @@ class CHDPPolicy(HybridPolicy):
             target.requires_grad_(False)
             target.train(False)
         self.value_scale = ValueScale(self.adapts_values)
-        self.select, self.select_deterministic, self.select_target = self._make_selections(spec.n_discrete_actions)
+        self.select, self.select_deterministic, self.select_target = self._make_selections()
 
         actor = self.actor
         self.discrete_optimizer = self._make_optimizer(actor.discrete_policy, lr_schedule)
@@ -135,22 +138,30 @@ class CHDPPolicy(HybridPolicy):
         spec, latent_dim = self.action_space.spec, self.action_space.latent_dim
         return CooperativeActor(
             self.action_space,
-            self._make_codebook(spec.n_discrete_actions, latent_dim),
+            self._make_codebook(),
             self._make_model(latent_dim, features_dim),
             self._make_model(spec.max_parameters, features_dim + latent_dim + N_READS),
             BilinearReads(features_dim, latent_dim, N_READS),
         )
 
-    def _make_codebook(self, n_discrete_actions: int, latent_dim: int) -> Codebook:
-        return Codebook(n_discrete_actions, latent_dim)
+    def _make_codebook(self) -> Codebook | ProductCodebook:
+        spec: HybridActionSpec = self.action_space.spec
+        if spec.is_factored:
+            return ProductCodebook(spec.radices, self.latent_dim)
+        return Codebook(spec.n_discrete_actions, self.action_space.latent_dim)
 
     def _make_model(self, dim: int, condition_dim: int) -> DiffusionModel:
         actor_arch = get_actor_critic_arch(self.net_arch)[0]
         return DiffusionModel(dim, condition_dim, self.n_diffusion_steps, actor_arch, self.activation_fn)
 
-    def _make_selections(self, n_discrete_actions: int) -> tuple[Selection, Selection, Selection]:
+    def _make_selections(self) -> tuple[Selection, Selection, Selection]:
         """:return: rules for acting, for deterministic predictions and for next actions"""
-        drawn = Selection(self.n_action_candidates, n_uniform=min(n_discrete_actions, MAX_UNIFORM_CANDIDATES))
+        spec = self.action_space.spec
+        n_alternatives = min(sum(spec.radices), MAX_ALTERNATIVES)
+        if spec.is_factored:
+            drawn = Selection(self.n_action_candidates, n_changed=n_alternatives)
+        else:
+            drawn = Selection(self.n_action_candidates, n_uniform=n_alternatives)
         acting = replace(drawn, n_random=N_RANDOM_CANDIDATES)
         return acting, replace(drawn, n_refined=N_REFINEMENT_CANDIDATES), Selection(n_drawn=1)
 
@@ -203,7 +214,7 @@ class CHDPPolicy(HybridPolicy):
         for _ in range(5):
             noise = th.as_tensor(rng.normal(0, spread, (len(undecided), centres.shape[1])), dtype=th.float32)
             candidates = (centres[undecided] + noise.to(self.device)).clamp(-1, 1)
-            fits = codebook.quantize(candidates) == k[undecided]
+            fits = ~codebook.strayed(candidates, k[undecided]).any(dim=1)
             latents[undecided[fits]] = candidates[fits]
             undecided = undecided[~fits]
             if len(undecided) == 0:
@@ -245,6 +256,7 @@ class CHDPPolicy(HybridPolicy):
                 features_extractor_kwargs=self.features_extractor_kwargs,
                 optimizer_class=self.optimizer_class,
                 optimizer_kwargs=self.optimizer_kwargs,
+                latent_dim=self.latent_dim,
                 n_diffusion_steps=self.n_diffusion_steps,
                 n_action_candidates=self.n_action_candidates,
                 lr_schedule=self._dummy_schedule,  # dummy lr schedule, not needed for loading policy alone

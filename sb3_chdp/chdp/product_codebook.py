@@ -2,7 +2,7 @@
 
 import torch as th
 
-from sb3_chdp.common.product_table import ProductTable
+from sb3_chdp.common.product_table import ProductTable, random_values
 
 
 class ProductCodebook(ProductTable):
@@ -14,10 +14,14 @@ class ProductCodebook(ProductTable):
     :param block_dim: width of the codewords of a choice at most, see :func:`block_widths`
     """
 
+    values: th.Tensor
+
     def __init__(self, radices: tuple[int, ...], block_dim: int):
         super().__init__(radices, block_dim)
         #: width d_e of a latent
         self.latent_dim = self.width
+        # (M, 2) choice and value, in the order of the masks
+        self.register_buffer("values", th.nonzero(self.exists), persistent=False)
 
     def quantize(self, latents: th.Tensor, masks: th.Tensor | None = None) -> th.Tensor:
         """
@@ -31,22 +35,58 @@ class ProductCodebook(ProductTable):
         """:return: (..., d_e) latents that stand for the (..., L) discrete actions, their codewords"""
         return self(k).detach()
 
+    def strayed(self, latents: th.Tensor, k: th.Tensor) -> th.Tensor:
+        """
+        :param latents: (B, d_e)
+        :param k: (B, L) discrete actions
+        :return: (B, d_e) which entries belong to a choice that does not decode to its value in k
+        """
+        return (self.quantize(latents) != k)[:, self.choice_of_slot]
+
+    def random(self, *shape: int, generator: th.Generator | None = None) -> th.Tensor:
+        """
+        :param shape: how many actions
+        :param generator: random generator on the CPU, the global one if None
+        :return: (*shape, L) uniformly random discrete actions
+        """
+        return random_values(self.radices, shape, generator=generator).to(self.vectors.device)
+
+    def alternatives(self, k: th.Tensor, n: int, repeatable: bool) -> th.Tensor:
+        """
+        Other discrete actions to try, which differ from the given ones in a single choice.
+
+        :param k: (B, L) discrete actions
+        :param n: number of alternatives to each, at most the sum of the radices
+        :param repeatable: whether to give the same choices the same values always
+        :return: (B, n, L) the actions with one value changed: successive values of all choices from a random one on, from the
+            first on if ``repeatable``
+        """
+        n_values = len(self.values)
+        first = 0 if repeatable else th.randint(n_values, (len(k), 1), device=k.device)
+        changes = self.values[(first + th.arange(n, device=k.device)) % n_values].expand(len(k), n, 2)
+        return k[:, None].repeat(1, n, 1).scatter(2, changes[..., :1], changes[..., 1:])
+
+    def allowed(self, k: th.Tensor, masks: th.Tensor) -> th.Tensor:
+        """
+        :param k: (B, n, L) discrete actions
+        :param masks: (B, sum of the radices) False for values that may not be taken
+        :return: (B, n) which of the discrete actions may be taken
+        """
+        return masks.gather(1, (self.places[:, 0] + k).flatten(1)).view(k.shape).all(dim=2)
+
+    def usage(self, k: th.Tensor) -> tuple[float, float]:
+        """
+        How many values of its choices a batch uses.
+
+        :param k: (B, L) discrete actions
+        :return: means over the choices: share of the values that occur, and perplexity of their frequencies
+        """
+        frequencies = (k[:, :, None] == th.arange(self.exists.shape[1], device=k.device)).float().mean(dim=0)
+        usage = (frequencies > 0).sum(dim=1) / self.exists.sum(dim=1)
+        perplexity = (-(th.special.xlogy(frequencies, frequencies)).sum(dim=1)).exp()
+        return usage.mean().item(), perplexity.mean().item()
+
     def project(self) -> None:
         """Move the codewords back into [-1, 1], where the latents are, after a gradient step."""
         with th.no_grad():
             self.vectors.clamp_(-1, 1)
-
-
-def choice_usage(k: th.Tensor, radices: tuple[int, ...]) -> tuple[float, float]:
-    """
-    How many values of its choices a batch uses.
-
-    :param k: (B, L) discrete actions
-    :param radices: numbers of values of the choices
-    :return: means over the choices: share of the values that occur, and perplexity of their frequencies
-    """
-    values = th.arange(max(radices), device=k.device)
-    frequencies = (k[:, :, None] == values).float().mean(dim=0)
-    usage = (frequencies > 0).sum(dim=1) / th.tensor(radices, device=k.device)
-    perplexity = (-(th.special.xlogy(frequencies, frequencies)).sum(dim=1)).exp()
-    return usage.mean().item(), perplexity.mean().item()

@@ -101,11 +101,6 @@ class HybridAlgorithm(BaseAlgorithm):
             return self.env is not None and is_masking_supported(self.env)
         return use_masking
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        if self.use_masking and self.env is not None and not is_masking_supported(self.env):
-            raise ValueError("use_masking is True but the environment has no method action_masks()")
-        return super()._setup_learn(*args, **kwargs)
-
     def _action_masks(self) -> np.ndarray | None:
         """:return: (n_envs, K) which discrete actions the environments allow now, None without masking"""
         assert self.env is not None, "the model has no environment"
@@ -144,8 +139,8 @@ class HybridAlgorithm(BaseAlgorithm):
         if self.action_layout == "factored" or n_actions > MAX_DISCRETE_ACTIONS:
             raise ValueError(
                 f"{type(self).__name__} needs one index for all of the {n_actions} joint discrete actions, at most "
-                f"{MAX_DISCRETE_ACTIONS} of action_layout='auto' or 'joint': use HPPO, PATD3, HHQNTD3 or HyARTD3, which take "
-                "every discrete part as a choice of its own"
+                f"{MAX_DISCRETE_ACTIONS} of action_layout='auto' or 'joint': use CHDP, HPPO, PATD3, HHQNTD3 or HyARTD3, which "
+                "take every discrete part as a choice of its own"
             )
         layout, self.action_layout = self.action_layout, "joint"
         try:
@@ -197,6 +192,8 @@ class HybridAlgorithm(BaseAlgorithm):
         super()._update_learning_rate(optimizers)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        if self.use_masking and self.env is not None and not is_masking_supported(self.env):
+            raise ValueError("use_masking is True but the environment has no method action_masks()")
         total_timesteps, callback = super()._setup_learn(*args, **kwargs)
         assert self.env is not None, "You must set the environment before calling learn()"
         try:
