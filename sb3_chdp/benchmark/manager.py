@@ -7,14 +7,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_chdp.benchmark.runs import STOCK, Run
+from sb3_chdp.benchmark.runs import Run
 from sb3_chdp.registry import ALGORITHMS
 from sb3_chdp.zoo import HybridExperimentManager, register
+from sb3_chdp.zoo_arguments import STOCK
 
-FLATTEN = "sb3_chdp.wrappers.FlattenHybridAction"
 # Evaluation environments: they fill a batch of the policy
 N_EVAL_ENVS = 8
 
@@ -27,7 +26,6 @@ class RunManager(HybridExperimentManager):
 
     def __init__(self, run: Run, trained_agent: str = ""):
         register()
-        self.flattened = run.algo.startswith(STOCK)
         super().__init__(
             # What enjoy reads from args.yml
             argparse.Namespace(**asdict(run), env_kwargs=None),
@@ -58,24 +56,6 @@ class RunManager(HybridExperimentManager):
 
     def _set_folder(self, folder: Path) -> None:
         self.save_path, self.params_path = str(folder), str(folder / self.env_name)
-
-    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        hyperparams, saved = super().read_hyperparameters()
-        if self.flattened:
-            for settings in (hyperparams, saved):
-                self._flatten(settings)
-        return hyperparams, saved
-
-    @staticmethod
-    def _flatten(settings: dict[str, Any]) -> None:
-        """Wrap the environment, and normalise as the first algorithm of this package does unless told otherwise."""
-        wrappers = settings.get("env_wrapper") or []
-        wrappers = [wrappers] if isinstance(wrappers, (str, dict)) else list(wrappers)
-        if not any(FLATTEN in str(wrapper) for wrapper in wrappers):
-            settings["env_wrapper"] = [*wrappers, FLATTEN]
-        defaults = yaml.safe_load(next(iter(ALGORITHMS.values())).hyperparams.read_text())["default"]
-        if "normalize" in defaults:
-            settings.setdefault("normalize", defaults["normalize"])
 
     def save_to(self, folder: Path, model: BaseAlgorithm) -> None:
         """
