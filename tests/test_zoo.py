@@ -133,7 +133,7 @@ def test_own_environment(algo, tmp_path):
     (tmp_path / "mine.py").write_text(OWN_ENV)
     settings = small("hppo") if algo == "hppo" else small("pa_td3")
     env = ["--env", "Own-v0", "--gym-packages", "mine"]
-    run("train", "--algo", algo, *env, "-n", "60", "--eval-freq", "30", "--eval-episodes", "1", "-params", *settings,
+    run("train", "--algo", algo, *env, "-n", "60", "--eval-freq", "30", "--eval-episodes", "2", "-params", *settings,
         cwd=tmp_path)  # fmt: skip
     folder = tmp_path / "logs" / algo.removeprefix("sb3:") / "Own-v0_1"
     for arguments in (["--algo", algo, *env], ["--gym-packages", "mine"]):

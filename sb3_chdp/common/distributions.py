@@ -88,15 +88,23 @@ class HybridDistribution(DiagGaussianDistribution):
 
     def sample(self) -> th.Tensor:
         """:return: (B, columns) rows"""
-        return self._rows(self.categorical.sample(), super().sample())
+        return self._rows(self.categorical.sample(), super().sample(), self.categorical.distribution.masks)
 
     def mode(self) -> th.Tensor:
         """:return: (B, columns) rows of the most probable k and the means"""
-        return self._rows(self.categorical.mode(), super().mode())
+        return self._rows(self.categorical.mode(), super().mode(), self.categorical.distribution.masks)
 
-    def _rows(self, k: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+    def most_probable(self, outputs: th.Tensor) -> th.Tensor:
+        """
+        :param outputs: (B, K + P) logits and means
+        :return: (B, columns) rows like :meth:`mode`, without masks and without the checks of a distribution, which no runtime
+            but Python knows
+        """
+        logits, means = outputs.split([self.n_discrete_actions, self.action_dim], dim=1)
+        return self._rows(logits.argmax(dim=1), means, None)
+
+    def _rows(self, k: th.Tensor, parameters: th.Tensor, masks: th.Tensor | None) -> th.Tensor:
         parts = {"discrete_actions": k, "parameters": parameters}
         if "masks" in self.columns:
-            masks = self.categorical.distribution.masks
-            parts["masks"] = th.ones(len(k), self.n_discrete_actions, device=k.device) if masks is None else masks
+            parts["masks"] = th.ones(k.shape[0], self.n_discrete_actions, device=k.device) if masks is None else masks
         return self.columns.pack(**parts)

@@ -120,7 +120,7 @@ class HybridActionSpec:
         index = np.where(mask, offsets[:-1, None] + np.arange(self.max_parameters), 0)
         # A shared layout has a single option that serves all K actions
         shape = (self.n_discrete_actions, self.max_parameters)
-        self.mask, self._centre, self._half, self.parameter_index = (
+        self.mask, self.centre, self.half_range, self.parameter_index = (
             np.broadcast_to(table, shape) for table in (mask, centre, half, index)
         )
 
@@ -151,7 +151,7 @@ class HybridActionSpec:
         if ((choices < 0) | (choices >= self.n_discrete_actions)).any():
             raise ValueError(f"The first column of a row must be in 0..{self.n_discrete_actions - 1}, got {choices}")
         scaled = np.clip(self.columns.view(rows, "parameters").astype(np.float64), -1.0, 1.0)
-        values = self._centre[choices] + self._half[choices] * scaled
+        values = self.centre[choices] + self.half_range[choices] * scaled
         return [self._assemble(int(k), v) for k, v in zip(choices, values, strict=True)]
 
     def _assemble(self, k: int, values: np.ndarray) -> Any:
@@ -195,8 +195,8 @@ class HybridActionSpec:
             k = int(np.ravel_multi_index(tuple(np.concatenate(digits).astype(np.int64)), self._radices))
         parameters = np.zeros(self.max_parameters)
         for box in self._boxes[0 if self.is_shared else k]:
-            values = np.ravel(get_part(action, box.path)).astype(np.float64) - self._centre[k, box.columns]
-            half = self._half[k, box.columns]
+            values = np.ravel(get_part(action, box.path)).astype(np.float64) - self.centre[k, box.columns]
+            half = self.half_range[k, box.columns]
             parameters[box.columns] = np.divide(values, half, out=np.zeros_like(values), where=half > 0)
         return self.columns.pack(discrete_actions=np.array([k]), parameters=parameters[None])[0]
 

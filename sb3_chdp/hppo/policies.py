@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_chdp.common.distributions import HybridDistribution
@@ -64,6 +64,9 @@ class HPPOPolicy(HybridPolicy, ActorCriticPolicy):
         self, observation: PyTorchObs, deterministic: bool = False, action_masks: np.ndarray | None = None
     ) -> th.Tensor:
         """:return: (n, columns) rows"""
+        if deterministic and action_masks is None:
+            features = BasePolicy.extract_features(self, observation, self.pi_features_extractor)
+            return self.action_dist.most_probable(self.action_net(self.mlp_extractor.forward_actor(features)))
         return self.get_distribution(observation, action_masks).get_actions(deterministic=deterministic)
 
     def predict(
