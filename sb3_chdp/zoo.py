@@ -31,8 +31,8 @@ def register() -> None:
 
 class HybridExperimentManager(ExperimentManager):
     """
-    rl_zoo3's manager, which flattens hybrid actions for SB3's own algorithms, and whose monitor notes success, and whatever else
-    the YAML file names, if the environment has it in its infos.
+    rl_zoo3's manager, which flattens hybrid actions for SB3's own algorithms, and whose monitor notes success, and whatever
+    else the YAML file names, if the environment has it in its infos.
     """
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:

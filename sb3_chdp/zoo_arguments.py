@@ -134,8 +134,8 @@ def complete(command: str, arguments: list[str]) -> list[str]:
         if number.isdigit() and (any_file or file.stem == env_name):
             newest = max(newest or (0.0, file.parent), (file.stat().st_mtime, file.parent))
     if newest is None:
-        wanted = " ".join(filter(None, [algo and f"of {algo}", env and f"on {env}"]))
-        raise ArgumentsError(f"no {'' if any_file else 'finished '}run {wanted + ' ' if wanted else ''}in {LOGS}; -f names another folder")
+        words = ["no", not any_file and "finished", "run", algo and f"of {algo}", env and f"on {env}", "in"]
+        raise ArgumentsError(f"{' '.join(filter(None, words))} {LOGS}; -f names another folder")
     run = newest[1]
     env_name, _, number = run.name.rpartition("_")
     added = [names.folder[0], LOGS]

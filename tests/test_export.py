@@ -57,18 +57,19 @@ def check(model, tmp_path, n=N):
     parts = list(observations.values()) if isinstance(observations, dict) else [observations]
     in_onnx = session.run(None, {place.name: part.numpy() for place, part in zip(session.get_inputs(), parts, strict=True)})
 
-    numpy_observations = {k: v.numpy() for k, v in observations.items()} if isinstance(observations, dict) else observations.numpy()
-    actions, _ = model.predict(numpy_observations, deterministic=True)
+    arrays = [part.numpy() for part in parts]
+    actions, _ = model.predict(
+        dict(zip(observations, arrays, strict=True)) if len(parts) > 1 else arrays[0], deterministic=True
+    )
     spec = model.policy.action_space.spec
     expected = np.stack([spec.to_row(action) for action in actions])
     choices = expected[:, 0].astype(int)
     if not isinstance(space, spaces.Discrete):
         assert len(set(choices)) > 1, "a policy that always decides the same shows nothing"
+    half = np.where(spec.half_range > 0, spec.half_range, 1)[choices]
     for k, parameters in (exported, in_onnx):
         np.testing.assert_array_equal(k, choices)
-        scaled = (np.asarray(parameters) - spec.centre[choices]) / np.where(spec.half_range[choices] > 0, spec.half_range[choices], 1)
-        np.testing.assert_allclose(scaled, expected[:, 1:], atol=1e-5)
-    return actions, in_onnx
+        np.testing.assert_allclose((np.asarray(parameters) - spec.centre[choices]) / half, expected[:, 1:], atol=1e-5)
 
 
 @pytest.mark.parametrize("name", [*BASELINES, pytest.param("CHDP", marks=WAITING), pytest.param("PaperCHDP", marks=WAITING)])
@@ -110,7 +111,7 @@ def test_parameters_are_in_the_units_of_the_space(layout):
 
 
 def test_other_policies_are_refused():
-    with pytest.raises(TypeError, match="policy must be model.policy of a model of sb3_chdp, got ActorCriticPolicy"):
+    with pytest.raises(TypeError, match=r"policy must be model\.policy of a model of sb3_chdp, got ActorCriticPolicy"):
         ExportablePolicy(PPO("MlpPolicy", gym.make("CartPole-v1")).policy)
 
 

@@ -5,7 +5,6 @@ import contextlib
 import os
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 

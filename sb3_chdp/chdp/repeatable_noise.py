@@ -40,8 +40,8 @@ def repeatable_uniform(observations: PyTorchObs, *shape: int, seed: int = 0) -> 
     Uniform numbers that depend on each observation alone, not on the rest of the batch.
 
     The entries of an observation, on a logarithmic scale, are added up with large random weights. Of the sums the fractions
-    count, the phases. They are mixed by a sine, without which observations of few bits have related numbers. Fractions of whole
-    multiples of the phases are the numbers.
+    count, the phases. They are mixed by a sine, without which observations of few bits have related numbers. The numbers
+    are the fractions of whole multiples of the phases.
 
     :param observations: batch of B observations: numbers of any kind, flat, images or a dict of these
     :param shape: of what each observation gets

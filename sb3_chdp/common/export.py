@@ -10,7 +10,7 @@ from sb3_chdp.common.policies import HybridPolicy
 
 class ExportablePolicy(nn.Module):
     """
-    What ``model.predict(observation, deterministic=True)`` decides, as numbers, for ``torch.onnx.export`` and ``torch.export``.
+    What ``model.predict(observation, deterministic=True)`` decides, in numbers, for ``torch.onnx.export`` and the like.
 
     :param policy: ``model.policy``; it is put into evaluation mode
     :raises TypeError: if the policy is not one of this package
@@ -34,8 +34,8 @@ class ExportablePolicy(nn.Module):
     def forward(self, observation: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """
         :param observation: n observations, as the environment gives them; images have their channels first
-        :return: (n,) int64 discrete actions k; (n, Pmax) their parameters in the units of the action space, those of nested boxes
-            one after the other, 0 behind the last one
+        :return: (n,) int64 discrete actions k; (n, Pmax) their parameters in the units of the action space, those of nested
+            boxes one after the other, 0 behind the last one
         """
         rows, columns = self.policy._predict(observation, deterministic=True), self.policy.action_space.columns
         k, scaled = columns.discrete_actions(rows), columns.view(rows, "parameters")

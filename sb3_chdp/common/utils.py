@@ -102,7 +102,7 @@ def hash_observations(observations: PyTorchObs) -> th.Tensor:
     :return: (B,) non-negative integers that depend on the content of each observation only
     """
     if th.compiler.is_exporting():
-        raise NotImplementedError("the noise of deterministic predictions depends on the bits of the observation, not exported")
+        raise NotImplementedError("the noise of deterministic predictions depends on the bits of the observation")
     parts = observations.values() if isinstance(observations, dict) else [observations]
     total: th.Tensor | int = 0
     for part in parts:

@@ -30,7 +30,13 @@ class Evaluation(NamedTuple):
 
 
 def make_card(
-    algo: str, env_id: str, repo_id: str, model_file: str, evaluation: Evaluation, hyperparams: Mapping[str, Any], has_video: bool
+    algo: str,
+    env_id: str,
+    repo_id: str,
+    model_file: str,
+    evaluation: Evaluation,
+    hyperparams: Mapping[str, Any],
+    has_video: bool,
 ) -> ModelCard:
     """
     :param algo: name of the algorithm
@@ -48,7 +54,7 @@ def make_card(
     metrics = evaluation.metrics()
     data = ModelCardData(
         library_name="stable-baselines3",
-        tags=[env_id, "deep-reinforcement-learning", "reinforcement-learning", "stable-baselines3", "sb3_chdp", "hybrid-actions"],
+        tags=[env_id, "deep-reinforcement-learning", "reinforcement-learning", "stable-baselines3", "sb3_chdp"],
         model_name=display_name,
         eval_results=[
             EvalResult(

@@ -26,7 +26,8 @@ VIDEO = "replay.mp4"
 
 def make_parser() -> argparse.ArgumentParser:
     """:return: the parser of the command line, with rl_zoo3's names"""
-    parser = argparse.ArgumentParser(prog="sb3-chdp push_to_hub", description="Publish a trained model on the Hugging Face Hub.")
+    description = "Publish a trained model on the Hugging Face Hub."
+    parser = argparse.ArgumentParser(prog="sb3-chdp push_to_hub", description=description)
     add = parser.add_argument
     add("--env", type=EnvironmentName, required=True, help="environment")
     add("--algo", required=True, choices=list(ALGOS), help="algorithm")
