@@ -19,7 +19,7 @@ OBSERVATIONS = {
     "uniform": floats(RNG.uniform(-1, 1, (B, 3))),
     "one number": floats(RNG.uniform(-1, 1, (B, 1))),
     "trajectory": floats(np.cumsum(RNG.normal(0, 1e-3, (B, 3)), axis=0)),
-    "line": floats(1 + 1e-5 * np.arange(B)[:, None] * np.ones((1, 4))),
+    "line": floats(1 + 1e-4 * np.arange(B)[:, None] * np.ones((1, 4))),
     "tiny": floats(RNG.uniform(-1e-4, 1e-4, (B, 3))),
     "large": floats(1e6 + RNG.uniform(-1e3, 1e3, (B, 3))),
     "whole": th.arange(B),
@@ -99,7 +99,7 @@ def test_uniform(observations):
 
 def test_frozen():
     """A model decides tomorrow as today."""
-    expected = [[-1.136711, 1.360198, 0.133176, -0.563554]]
+    expected = [[0.389095, -0.034483, 0.945737, -0.065379]]
     np.testing.assert_allclose(repeatable_noise(th.tensor([[0.5, -2.0]]), 4).numpy(), expected, atol=1e-6)
 
 

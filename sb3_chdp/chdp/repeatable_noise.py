@@ -16,17 +16,19 @@ N_PHASES = 4
 # Single precision, in which exporters keep constants, holds all of these exactly.
 # What is smaller counts on a linear scale, the rest on a logarithmic one
 SMALL_ENTRY = 2.0**-20
-# Together they tell observations apart that differ by a millionth. Rounding errors, here below 1e-11, grow likewise
-OBSERVATION_FREQUENCY, MIXING, VALUE_FREQUENCY = 100.0, 8.0, 1_024
-# The largest float32 below 1; and what keeps noise below 5.7 in size
-BELOW_ONE, SMALLEST = 1 - 2.0**-24, 2.0**-23
+# Together they enlarge differences between observations some 100,000 times: noise is unrelated from a difference of 1e-4 on.
+# Rounding errors, which no two runtimes share, grow likewise, and have to stay small
+OBSERVATION_FREQUENCY, MIXING, VALUE_FREQUENCY = 64.0, 2.0, 256
+# The largest float32 below 1; and what keeps noise below 4.4 in size, where rounding errors would show
+BELOW_ONE, SMALLEST = 1 - 2.0**-24, 2.0**-14
 FULL_TURN = float(np.float32(2 * math.pi))
 
 
 @cache
 def _observation_frequencies(n_entries: int) -> np.ndarray:
     """:return: (1 + n_entries, N_PHASES), the same on every machine: NumPy has frozen this generator"""
-    return np.random.RandomState(0).uniform(-OBSERVATION_FREQUENCY, OBSERVATION_FREQUENCY, (1 + n_entries, N_PHASES))
+    frequencies = np.random.RandomState(0).uniform(-OBSERVATION_FREQUENCY, OBSERVATION_FREQUENCY, (1 + n_entries, N_PHASES))
+    return frequencies / math.sqrt(n_entries)
 
 
 @cache
