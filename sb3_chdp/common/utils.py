@@ -108,7 +108,7 @@ def nearest_row(points: th.Tensor, table: th.Tensor, masks: th.Tensor | None = N
     factors, squares = -2 * points, th.linalg.vecdot(table, table)
     if masks is not None:
         return th.addmm(squares, factors, table.t()).masked_fill(~masks, th.inf).min(dim=1).indices
-    if n_rows <= NEAREST_ROW_CHUNK:
+    if n_rows <= NEAREST_ROW_CHUNK or th.compiler.is_exporting():
         return th.addmm(squares, factors, table.t()).min(dim=1).indices
     # The distances to all rows of a large table do not fit into the processor's cache, and the place of a minimum takes
     # longer to find than its value: first the nearest group of rows, chunk by chunk, then the row within the group
@@ -133,6 +133,8 @@ def hash_observations(observations: PyTorchObs) -> th.Tensor:
     :param observations: batch of observations
     :return: (B,) non-negative integers that depend on the content of each observation only
     """
+    if th.compiler.is_exporting():
+        raise NotImplementedError("the noise of deterministic predictions depends on the bits of the observation")
     parts = observations.values() if isinstance(observations, dict) else [observations]
     total: th.Tensor | int = 0
     for part in parts:
