@@ -17,10 +17,10 @@ from tests.hybrid_envs import LayoutEnv, box, layouts, make_layout_env
 ort = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
-BASELINES = ["HPPO", "PATD3", "PDQNTD3", "HHQNTD3", "HyARTD3"]
-WAITING = pytest.mark.xfail(strict=True, raises=NotImplementedError, reason="noise depends on the bits of the observation")
+ALGORITHMS = ["CHDP", "PaperCHDP", "HPPO", "PATD3", "PDQNTD3", "HHQNTD3", "HyARTD3"]
 N = 1_000
 PAGE = Path(__file__).parent.parent / "docs" / "guide" / "export.md"
+FACTORED = spaces.Tuple((spaces.MultiDiscrete([40, 3, 30]), box(-1, 1, 2)))
 MANY = spaces.Tuple((spaces.Discrete(2_500), box(-1, 1, 1)))
 
 
@@ -63,16 +63,17 @@ def check(model, tmp_path, n=N):
     )
     spec = model.policy.action_space.spec
     expected = np.stack([spec.to_row(action) for action in actions])
-    choices = expected[:, 0].astype(int)
+    choices, own_parameters = spec.columns.discrete_actions(expected), spec.columns.view(expected, "parameters")
+    options = spec.options_of(choices)
     if not isinstance(space, spaces.Discrete):
-        assert len(set(choices)) > 1, "a policy that always decides the same shows nothing"
-    half = np.where(spec.half_range > 0, spec.half_range, 1)[choices]
+        assert len(np.unique(choices, axis=0)) > 1, "a policy that always decides the same shows nothing"
+    half = np.where(spec.half_range > 0, spec.half_range, 1)[options]
     for k, parameters in (exported, in_onnx):
         np.testing.assert_array_equal(k, choices)
-        np.testing.assert_allclose((np.asarray(parameters) - spec.centre[choices]) / half, expected[:, 1:], atol=1e-5)
+        np.testing.assert_allclose((np.asarray(parameters) - spec.centre[options]) / half, own_parameters, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", [*BASELINES, pytest.param("CHDP", marks=WAITING), pytest.param("PaperCHDP", marks=WAITING)])
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_algorithm(name, tmp_path):
     check(getattr(sb3_chdp, name)("MlpPolicy", make_layout_env("flat"), seed=1), tmp_path)
 
@@ -92,6 +93,11 @@ def test_observations(kind, tmp_path):
 
 def test_many_discrete_actions(tmp_path):
     check(sb3_chdp.HyARTD3("MlpPolicy", LayoutEnv(MANY), seed=0, buffer_size=10), tmp_path, n=50)
+
+
+@pytest.mark.parametrize("name", ["HPPO", "PATD3", "HHQNTD3", "HyARTD3"])
+def test_factored_actions(name, tmp_path):
+    check(getattr(sb3_chdp, name)("MlpPolicy", LayoutEnv(FACTORED), seed=0), tmp_path, n=50)
 
 
 @pytest.mark.parametrize("layout", layouts())

@@ -34,15 +34,16 @@ class ExportablePolicy(nn.Module):
     def forward(self, observation: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """
         :param observation: n observations, as the environment gives them; images have their channels first
-        :return: (n,) int64 discrete actions k; (n, Pmax) their parameters in the units of the action space, those of nested
-            boxes one after the other, 0 behind the last one
+        :return: (n,) int64 discrete actions k, (n, L) of a factored space; (n, Pmax) their parameters in the units of the
+            action space, those of nested boxes one after the other, 0 behind the last one
         """
         rows, columns = self.policy._predict(observation, deterministic=True), self.policy.action_space.columns
         k, scaled = columns.discrete_actions(rows), columns.view(rows, "parameters")
+        options = self.policy.action_space.spec.options_of(k)
         if isinstance(self.policy.action_space, ConcatenatedBox):
             # Rows with the parameters of all actions
-            scaled = scaled.gather(1, self.parameter_index[k])
-        low, high = self.low[k], self.high[k]
+            scaled = scaled.gather(1, self.parameter_index[options])
+        low, high = self.low[options], self.high[options]
         # Clamped once more: rounding must not lead out of the box
         parameters = low + (high - low) * (scaled.clamp(-1, 1) + 1) / 2
         return k, parameters.maximum(low).minimum(high)
