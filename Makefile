@@ -14,7 +14,7 @@ export OMP_NUM_THREADS ?= 1
 $(STAMP): setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .[zoo,render,plots,tests,docs]
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .[zoo,render,plots,export,tests,docs]
 	touch $(STAMP)
 
 train: $(STAMP)

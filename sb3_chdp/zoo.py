@@ -1,7 +1,10 @@
 """Registration with rl_zoo3. Importing this module imports rl_zoo3, which patches Gymnasium."""
 
+from typing import Any
+
 import gymnasium as gym
 import rl_zoo3.exp_manager
+import yaml
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
@@ -9,8 +12,11 @@ from stable_baselines3.common import callbacks
 from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_chdp
+from sb3_chdp.common.base_class import HYBRID_SPACES
 from sb3_chdp.common.evaluation import evaluate_policy
 from sb3_chdp.registry import ALGORITHMS
+
+FLATTEN = "sb3_chdp.wrappers.FlattenHybridAction"
 
 
 def register() -> None:
@@ -28,19 +34,39 @@ def register() -> None:
 
 
 class HybridExperimentManager(ExperimentManager):
-    """rl_zoo3's manager; the monitor notes only what the environment has in its infos, which need not be success."""
+    """
+    rl_zoo3's manager, which flattens hybrid actions for SB3's own algorithms, and whose monitor notes success, and whatever
+    else the YAML file names, if the environment has it in its infos.
+    """
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        hyperparams, saved = super().read_hyperparameters()
+        if self.algo not in ALGORITHMS and isinstance(self._example()[0], HYBRID_SPACES):
+            for settings in (hyperparams, saved):
+                _flatten(settings)
+        return hyperparams, saved
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
-        wanted = self.monitor_kwargs.get("info_keywords", ())
-        if wanted:
-            present = self._info_keywords()
-            self.monitor_kwargs = {**self.monitor_kwargs, "info_keywords": tuple(key for key in wanted if key in present)}
+        wanted = dict.fromkeys([*self.monitor_kwargs.get("info_keywords", ()), "is_success"])
+        present = self._example()[1]
+        self.monitor_kwargs = {**self.monitor_kwargs, "info_keywords": tuple(key for key in wanted if key in present)}
         return super().create_envs(n_envs, eval_env, no_log)
 
-    def _info_keywords(self) -> set[str]:
-        """:return: what the environment has in the info of a step"""
+    def _example(self) -> tuple[gym.Space[Any], dict[str, Any]]:
+        """:return: action space of the environment, and info of a step"""
         env = gym.make(self.env_name.gym_id, **self.env_kwargs)
         env.reset(seed=0)
         info = env.step(env.action_space.sample())[-1]
         env.close()
-        return set(info)
+        return env.action_space, info
+
+
+def _flatten(settings: dict[str, Any]) -> None:
+    """Wrap the environment, and normalise as the first algorithm of this package does unless told otherwise."""
+    wrappers = settings.get("env_wrapper") or []
+    wrappers = [wrappers] if isinstance(wrappers, (str, dict)) else list(wrappers)
+    if not any(FLATTEN in str(wrapper) for wrapper in wrappers):
+        settings["env_wrapper"] = [*wrappers, FLATTEN]
+    defaults = yaml.safe_load(next(iter(ALGORITHMS.values())).hyperparams.read_text())["default"]
+    if "normalize" in defaults:
+        settings.setdefault("normalize", defaults["normalize"])

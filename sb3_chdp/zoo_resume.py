@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_chdp.common.checkpoint_store import CheckpointStore
 from sb3_chdp.common.resume import ResumableCheckpoint, resume
 from sb3_chdp.zoo import HybridExperimentManager
+from sb3_chdp.zoo_arguments import ArgumentsError
 
 CHECKPOINTS = "resumable"
 ARGUMENTS = "arguments.json"
@@ -80,16 +81,16 @@ def prepare_training(arguments: list[str]) -> list[str]:
 
     :param arguments: those of the script, or ``["--resume", folder of the run]``
     :return: arguments for the script: with ``--resume`` those of the killed run
-    :raises ValueError: for further arguments beside ``--resume``, or a folder without checkpoints
+    :raises ArgumentsError: for further arguments beside ``--resume``, or a folder without checkpoints
     """
     run = None
     if any(argument.split("=")[0] == "--resume" for argument in arguments):
         parts = [part for argument in arguments for part in argument.split("=", 1)]
         if len(parts) != 2 or parts[0] != "--resume":
-            raise ValueError(f"--resume takes the folder of a run and no other arguments, got {' '.join(arguments)}")
+            raise ArgumentsError(f"--resume takes the folder of a run and no other arguments, got {' '.join(arguments)}")
         run = Path(parts[1])
         if not (run / ARGUMENTS).is_file() or not CheckpointStore(run / CHECKPOINTS).generations():
-            raise ValueError(f"--resume: {run} holds no resumable checkpoint, which train writes with --save-freq")
+            raise ArgumentsError(f"--resume: {run} holds no resumable checkpoint, which train writes with --save-freq")
         arguments = json.loads((run / ARGUMENTS).read_text())
     # The script constructs it
     ResumableExperimentManager.arguments, ResumableExperimentManager.run = arguments, run

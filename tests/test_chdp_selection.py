@@ -6,7 +6,6 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_chdp.chdp.candidates import Selection
-from sb3_chdp.common.utils import hash_observations
 from tests.algorithms import calls_of, filled_model
 from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, make_layout_env
 
@@ -186,14 +185,3 @@ def test_predictions_are_valid(env):
     obs = np.stack([env.observation_space.sample() for _ in range(50)])
     for deterministic in (False, True):
         assert all(env.action_space.contains(action) for action in model.predict(obs, deterministic=deterministic)[0])
-
-
-def test_noise_of_deterministic_predictions_depends_on_the_observation():
-    vectors, images = th.rand(1000, 4), th.randint(256, (1000, 1, 6, 6), dtype=th.uint8)
-    for observations in (vectors, images, {"v": vectors, "i": images}):
-        hashes = hash_observations(observations)
-        assert hashes.shape == (1000,) and len((hashes % 1024).unique()) > 550  # 637 of 1024 expected
-        if isinstance(observations, th.Tensor):
-            assert (hash_observations(observations[5:7]) == hashes[5:7]).all()
-    # A small change is enough
-    assert (hash_observations(vectors + 1e-6) != hash_observations(vectors)).float().mean() > 0.99

@@ -59,8 +59,9 @@ def test_classes_of_the_registry_are_exported():
         _ = sb3_chdp.NoAlgorithm
 
 
-def test_example_of_the_readme():
+def test_example_of_the_readme(capsys):
     code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1]
     names: dict = {}
-    exec(code.replace("5_000", "150"), names)
+    exec(code.replace("2_000", "150"), names)
     assert names["Drone"].action_space.contains(names["action"])
+    assert re.fullmatch(r"success of CHDP \d+% and of SAC on flat actions \d+%\n", capsys.readouterr().out)

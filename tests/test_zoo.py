@@ -70,14 +70,80 @@ def test_enjoy_renders(trained):
     run("enjoy", "--env", ENV_ID, "-f", "logs", "-n", "5", cwd=trained)
 
 
+def test_enjoy_without_arguments(trained):
+    """The run that was trained last, of those in the folder logs."""
+    assert f"logs/chdp/{ENV_ID}_1" in run("enjoy", "--no-render", "-n", "5", cwd=trained)
+
+
 def test_plot(trained):
-    assert "No data" not in run("plot", "--env", ENV_ID, "-f", "logs", "-y", "success", "-w", "2", cwd=trained)
-    run("all_plots", "-a", "chdp", "-e", ENV_ID, "-f", "logs", "-k", "successes", "--no-display", "-o", "post", cwd=trained)
+    for arguments in (["--env", ENV_ID, "-f", "logs", "-y", "success"], []):
+        output = run("plot", *arguments, "-w", "2", "-o", "pictures/plot.png", cwd=trained)
+        assert output == "Saving to pictures/plot.png\n", "no warnings either"
+        picture = trained / "pictures" / "plot.png"
+        assert picture.read_bytes().startswith(b"\x89PNG")
+        picture.unlink()
+    assert "-o FILE.png" in run("plot", "-w", "2", cwd=trained, code=1), "there is no display"
+    assert "nothing to plot" in run("plot", "-w", "5000", "-o", "plot.png", cwd=trained, code=1)
+
+
+def test_all_plots(trained):
+    output = run("all_plots", "-a", "chdp", "-e", ENV_ID, "-f", "logs", "-k", "successes", "-o", "all.png", cwd=trained)
+    assert "Warning" not in output and (trained / "all.png").read_bytes().startswith(b"\x89PNG")
+    run("all_plots", "-o", "post", cwd=trained)
+    assert (trained / "post.pkl").is_file()
 
 
 def test_record(trained):
     run("record", "--env", ENV_ID, "-f", "logs", "-n", "20", "-o", "videos", cwd=trained)
     assert list((trained / "videos").glob("*.mp4"))
+
+
+OWN_ENV = """
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box, Discrete, Tuple
+
+
+class OwnEnv(gym.Env):
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    action_space = Tuple((Discrete(2), Box(-1, 1, (1,))))
+    observation_space = Box(-1, 1, (2,))
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(2, np.float32), float(action[1][0]), False, False, {}
+
+    def render(self):
+        return np.zeros((16, 16, 3), np.uint8)
+
+
+gym.register("Own-v0", OwnEnv, max_episode_steps=5)
+"""
+
+
+@pytest.mark.parametrize("algo", ["hppo", "sb3:sac"])
+def test_own_environment(algo, tmp_path):
+    """With every command; its info says nothing about success."""
+    (tmp_path / "mine.py").write_text(OWN_ENV)
+    settings = small("hppo") if algo == "hppo" else small("pa_td3")
+    env = ["--env", "Own-v0", "--gym-packages", "mine"]
+    run("train", "--algo", algo, *env, "-n", "60", "--eval-freq", "30", "--eval-episodes", "2", "-params", *settings,
+        cwd=tmp_path)  # fmt: skip
+    folder = tmp_path / "logs" / algo.removeprefix("sb3:") / "Own-v0_1"
+    for arguments in (["--algo", algo, *env], ["--gym-packages", "mine"]):
+        run("enjoy", *arguments, "--no-render", "-n", "20", cwd=tmp_path)
+        run("record", *arguments, "-n", "5", cwd=tmp_path)
+        assert list(folder.glob("videos/*.mp4"))
+        run("plot", *arguments, "-w", "2", "-o", "plot.png", cwd=tmp_path)
+        run("all_plots", *arguments, "-o", "all.png", cwd=tmp_path)
+    message = run("enjoy", "--no-render", cwd=tmp_path, code=1)
+    assert message == "sb3-chdp enjoy: unknown environment 'Own-v0' (--gym-packages names the module that registers it)\n"
 
 
 def test_optimize_and_train_the_best_trial(trained):
@@ -140,17 +206,17 @@ def test_the_yaml_file_names_the_replay_buffer(tmp_path):
     assert isinstance(model.replay_buffer, PrioritizedReplayBuffer)
 
 
-def test_stock_algorithm_on_the_flattened_environment(trained):
-    (trained / "sac.yml").write_text(
-        "default:\n  n_timesteps: 120\n  policy: MlpPolicy\n  env_wrapper: sb3_chdp.wrappers.FlattenHybridAction\n"
-    )
-    run("train", "--algo", "sac", "--env", ENV_ID, "-conf", "sac.yml", "--eval-freq", "-1", "-f", "stock", cwd=trained)
+def test_stock_algorithm_with_a_wrapper_of_the_users(trained):
+    """FlattenHybridAction comes on top, once."""
+    wrappers = "[gymnasium.wrappers.NormalizeReward, sb3_chdp.wrappers.FlattenHybridAction]"
+    (trained / "sac.yml").write_text(f"default: {{n_timesteps: 120, policy: MlpPolicy, env_wrapper: {wrappers}}}\n")
+    run("train", "--algo", "sb3:sac", "--env", ENV_ID, "-conf", "sac.yml", "--eval-freq", "-1", "-f", "stock", cwd=trained)
 
 
 def test_help_and_unknown_command(tmp_path):
     assert "sb3-chdp train" in run("--help", cwd=tmp_path)
     message = run("trian", cwd=tmp_path, code=1)
-    assert "unknown command 'trian'" in message and all(script in message for script in SCRIPTS)
+    assert "unknown command 'trian', did you mean train?" in message and all(script in message for script in SCRIPTS)
 
 
 def test_without_the_zoo_extra(tmp_path):
@@ -162,7 +228,7 @@ def test_without_the_zoo_extra(tmp_path):
     )
     result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
     assert result.returncode == 1
-    assert result.stderr.strip() == "sb3-chdp train needs rl_zoo3: pip install 'sb3-chdp[zoo]'"
+    assert result.stderr.strip() == "sb3-chdp train needs rl_zoo3: pip install '.[zoo]' in a clone of this package"
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS.values(), ids=lambda algorithm: algorithm.name)

@@ -10,8 +10,6 @@ command goes on where it was interrupted, and adds what is new: seeds, algorithm
 """
 
 import argparse
-import difflib
-import importlib
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -26,9 +24,10 @@ from rich.live import Live
 from sb3_chdp.benchmark import figures, jobs, paper, tables
 from sb3_chdp.benchmark.overview import Overview
 from sb3_chdp.benchmark.results import ResultsError, read_results
-from sb3_chdp.benchmark.runs import STOCK, Run
+from sb3_chdp.benchmark.runs import Run
 from sb3_chdp.benchmark.statistics import scores_of
 from sb3_chdp.registry import ALGORITHMS
+from sb3_chdp.zoo_arguments import STOCK, import_packages, unknown
 
 SLURM = "--slurm-"
 
@@ -89,8 +88,7 @@ def check_names(parser: argparse.ArgumentParser, args: argparse.Namespace) -> No
     """Refuse algorithms and environments that nobody knows, with a hint."""
     from rl_zoo3.utils import ALGOS
 
-    for package in args.gym_packages:
-        importlib.import_module(package)
+    import_packages(args.gym_packages)
     known_algos = [*ALGORITHMS, *(STOCK + name for name in ALGOS)]
     for kind, names, known, hint in (
         ("algorithm", args.algos, known_algos, f"known are {', '.join(known_algos)}"),
@@ -98,8 +96,7 @@ def check_names(parser: argparse.ArgumentParser, args: argparse.Namespace) -> No
     ):
         for name in names or []:
             if name not in known:
-                close = difflib.get_close_matches(name, known, n=1)
-                parser.error(f"unknown {kind} {name!r}{f', did you mean {close[0]}?' if close else ''} ({hint})")
+                parser.error(unknown(kind, name, known, hint))
 
 
 def make_runs(args: argparse.Namespace) -> list[Run]:
@@ -203,6 +200,7 @@ def main(arguments: list[str]) -> int:
     """
     :param arguments: what stands behind ``sb3-chdp benchmark``
     :return: 0, or 1 if runs failed
+    :raises ArgumentsError: for a module of ``--gym-packages`` that there is not
     """
     args, options = parse(arguments)
     console = Console()

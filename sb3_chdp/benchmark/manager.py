@@ -7,17 +7,16 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_chdp.benchmark.runs import STOCK, Run
+from sb3_chdp.benchmark.runs import Run
 from sb3_chdp.common.checkpoint_store import CheckpointStore
 from sb3_chdp.common.resume import resume
 from sb3_chdp.registry import ALGORITHMS
 from sb3_chdp.zoo import HybridExperimentManager, register
+from sb3_chdp.zoo_arguments import STOCK
 
-FLATTEN = "sb3_chdp.wrappers.FlattenHybridAction"
 # Evaluation environments: they fill a batch of the policy
 N_EVAL_ENVS = 8
 
@@ -30,7 +29,6 @@ class RunManager(HybridExperimentManager):
     def __init__(self, run: Run):
         register()
         self.run = run
-        self.flattened = run.algo.startswith(STOCK)
         super().__init__(
             # What enjoy reads from args.yml
             argparse.Namespace(**asdict(run), env_kwargs=None),
@@ -58,24 +56,6 @@ class RunManager(HybridExperimentManager):
         if run.conf_folder and own.is_file():
             return str(own)
         return None if run.algo.startswith(STOCK) else str(ALGORITHMS[run.algo].hyperparams)
-
-    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        hyperparams, saved = super().read_hyperparameters()
-        if self.flattened:
-            for settings in (hyperparams, saved):
-                self._flatten(settings)
-        return hyperparams, saved
-
-    @staticmethod
-    def _flatten(settings: dict[str, Any]) -> None:
-        """Wrap the environment, and normalise as the first algorithm of this package does unless told otherwise."""
-        wrappers = settings.get("env_wrapper") or []
-        wrappers = [wrappers] if isinstance(wrappers, (str, dict)) else list(wrappers)
-        if not any(FLATTEN in str(wrapper) for wrapper in wrappers):
-            settings["env_wrapper"] = [*wrappers, FLATTEN]
-        defaults = yaml.safe_load(next(iter(ALGORITHMS.values())).hyperparams.read_text())["default"]
-        if "normalize" in defaults:
-            settings.setdefault("normalize", defaults["normalize"])
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         return resume(self.run.checkpoints, env, device=self.device)

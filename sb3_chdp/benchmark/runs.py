@@ -7,8 +7,8 @@ from typing import Any
 
 from sb3_chdp.benchmark.results import ResultsError, Row, differences, read_meta, read_rows
 from sb3_chdp.registry import ALGORITHMS
+from sb3_chdp.zoo_arguments import STOCK
 
-STOCK = "sb3:"
 # Evaluations of a run, evenly spaced
 N_EVALUATIONS = 30
 

@@ -1,8 +1,10 @@
 """Selection: several actions per observation, of which the critics choose one."""
 
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
+import numpy as np
 import torch as th
 
 from sb3_chdp.chdp.actor import CooperativeActor
@@ -43,7 +45,7 @@ class Candidates(NamedTuple):
 
     def join(self, others: "Candidates") -> "Candidates":
         """:return: these and the others, which may be the same for all observations (B = 1)"""
-        batch_size = len(self.latents)
+        batch_size = self.latents.shape[0]
         return Candidates(*(th.cat([a, b.expand(batch_size, *b.shape[1:])], dim=1) for a, b in zip(self, others, strict=True)))
 
     def best(self, critic: HybridCritic, features: th.Tensor, allowed: th.Tensor | None = None) -> SelectedActions:
@@ -82,7 +84,8 @@ def drawn_candidates(
         None: draw
     :param masks: (B, K) False for discrete actions that the discrete policy may not draw, None if it may draw all
     """
-    batch_size, codebook = len(features), actor.codebook
+    # Not len(), at which torch.export would take the size of its example for the only one
+    batch_size, codebook = features.shape[0], actor.codebook
     latent_noise, parameter_noise = (None, None) if noise is None else noise
     masks = None if masks is None else masks.repeat_interleave(n, dim=0)
     latents, k = actor.sample_latents(features.repeat_interleave(n, dim=0), latent_noise, masks)
@@ -125,6 +128,12 @@ def changed_candidates(actor: CooperativeActor, actions: SelectedActions, n: int
     return Candidates(actions.latents[:, None], actions.discrete_actions[:, None], actions.parameters[:, None]).join(changed)
 
 
+@cache
+def _variations(n: int, n_parameters: int) -> np.ndarray:
+    """:return: (1, n, Pmax) float32, standard normal, constants for those who export a policy"""
+    return np.random.RandomState(0).standard_normal((1, n, n_parameters)).astype(np.float32)
+
+
 def varied_candidates(actor: CooperativeActor, actions: SelectedActions, n: int, spread: float) -> Candidates:
     """
     Actions and n Gaussian variations of the parameters of each, always the same ones.
@@ -136,7 +145,7 @@ def varied_candidates(actor: CooperativeActor, actions: SelectedActions, n: int,
     :return: candidates of B observations, the given action first, n + 1 in all
     """
     latents, k, parameters, _ = actions
-    noise = th.randn(1, n, parameters.shape[1], generator=th.Generator().manual_seed(0)).to(parameters.device)
+    noise = th.as_tensor(_variations(n, parameters.shape[1]), device=parameters.device)
     mask = actor.mask(k)
     varied = (parameters[:, None] + spread * (noise if mask is None else noise * mask[:, None])).clamp(-1, 1)
     return Candidates(
@@ -188,7 +197,7 @@ class Selection:
 
         candidates = drawn_candidates(actor, features, self.n_drawn, self.n_uniform, noise, masks)
         if self.n_random > 0:
-            candidates = candidates.join(random_candidates(actor, len(features), self.n_random, noise is not None))
+            candidates = candidates.join(random_candidates(actor, features.shape[0], self.n_random, noise is not None))
         best = candidates.best(critic, features, allowed(candidates))
         if self.n_changed > 0:
             candidates = changed_candidates(actor, best, self.n_changed, noise is not None)

@@ -17,19 +17,18 @@ from sb3_chdp.chdp.codebook import Codebook
 from sb3_chdp.chdp.critic import BilinearReads, HybridCritic, QNetwork
 from sb3_chdp.chdp.diffusion import DiffusionModel
 from sb3_chdp.chdp.product_codebook import ProductCodebook
+from sb3_chdp.chdp.repeatable_noise import repeatable_noise
 from sb3_chdp.chdp.value_scale import ValueScale
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.normalization import NormalizedCombinedExtractor, NormalizedExtractor
 from sb3_chdp.common.policies import CnnFeatures, HybridPolicy
 from sb3_chdp.common.spaces import HybridActionSpec
-from sb3_chdp.common.utils import default_optimizer_kwargs, hash_observations
+from sb3_chdp.common.utils import default_optimizer_kwargs
 
 # Bilinear reads of critics and continuous policy
 N_READS = 8
 # Spread of the latents around a codeword in random actions
 RANDOM_LATENT_NOISE = 0.1
-# Number of noise chains that repeatable draws choose from
-FIXED_NOISE_CHAINS = 1024
 # Discrete actions that compete beside those drawn, all of them if there are no more; in a factored space changes of one choice
 MAX_ALTERNATIVES = 64
 # Uniformly random actions that compete
@@ -62,9 +61,6 @@ class CHDPPolicy(HybridPolicy):
 
     # Whether the units of the critics follow the rewards, see ValueScale
     adapts_values: ClassVar[bool] = True
-
-    fixed_latent_noise: th.Tensor
-    fixed_parameter_noise: th.Tensor
 
     def __init__(
         self,
@@ -119,12 +115,6 @@ class CHDPPolicy(HybridPolicy):
         self.critic.optimizer = self._make_optimizer(self.critic, lr_schedule)
         self.codebook_optimizer = self._make_optimizer(actor.codebook, lr_schedule)
 
-        # Noise of deterministic predictions, the same for every model
-        generator = th.Generator().manual_seed(0)
-        for name, model in (("latent", actor.discrete_policy), ("parameter", actor.continuous_policy)):
-            noise = th.randn((model.n_steps, FIXED_NOISE_CHAINS, model.dim), generator=generator)
-            self.register_buffer(f"fixed_{name}_noise", noise, persistent=False)
-
     def _make_critic(self, extractor: BaseFeaturesExtractor) -> HybridCritic:
         latent_dim, n_parameters = self.action_space.latent_dim, self.action_space.spec.max_parameters
         critic_arch = get_actor_critic_arch(self.net_arch)[1]
@@ -178,29 +168,31 @@ class CHDPPolicy(HybridPolicy):
         """
         Draw actions and keep the one of highest target min(Q1, Q2), see :class:`Selection`.
 
-        Deterministic predictions take their noise from a fixed store, at a place that depends on the observation: one and
-        the same noise in all states would repeat a policy's mistakes where sampling gets away from them. They use the
-        target policies, averages of the policies over the last updates, which do not waver as those do, and refine what
-        they chose.
+        The noise of deterministic predictions is a function of the observation: one and the same noise in all states would
+        repeat a policy's mistakes where sampling gets away from them. They use the target policies, averages of the policies
+        over the last updates, which do not waver as those do, and refine what they chose.
 
         :return: (B, columns) rows
         """
         features = self.critic_target.features(observation)
         if deterministic:
-            select, actor, noise = self.select_deterministic, self.actor_target, self._fixed_noise(observation)
+            select, actor, noise = self.select_deterministic, self.actor_target, self._noise_of(observation)
         else:
             select, actor, noise = self.select, self.actor, None
         latents, k, parameters, _ = select(actor, self.critic_target, features, noise, action_masks)
         return self.action_space.columns.pack(discrete_actions=k.float(), parameters=parameters, latents=latents)
 
-    def _fixed_noise(self, observation: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
-        n_drawn, n_all = self.select.n_drawn, self.select.n_drawn + self.select.n_uniform
-        hashes = hash_observations(observation)
-        chains = (hashes[:, None] + th.arange(n_all, device=hashes.device)) % FIXED_NOISE_CHAINS
-        return (
-            self.fixed_latent_noise[:, chains[:, :n_drawn].flatten()],
-            self.fixed_parameter_noise[:, chains.flatten()],
+    def _noise_of(self, observation: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
+        """:return: noise of both policies' chains in deterministic predictions, the same for every model"""
+        n_drawn, n_uniform = self.select_deterministic.n_drawn, self.select_deterministic.n_uniform
+        latent_noise, parameter_noise = (
+            repeatable_noise(observation, n, model.n_steps, model.dim, seed=seed).flatten(0, 1).transpose(0, 1)
+            for n, model, seed in (
+                (n_drawn, self.actor_target.discrete_policy, 1),
+                (n_drawn + n_uniform, self.actor_target.continuous_policy, 2),
+            )
         )
+        return latent_noise, parameter_noise
 
     def random_rows(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
         """Uniformly random actions; their latents scatter around the codewords and decode to the actions."""

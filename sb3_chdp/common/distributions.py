@@ -14,7 +14,7 @@ from stable_baselines3.common.distributions import DiagGaussianDistribution
 from torch import nn
 
 from sb3_chdp.common.hybrid_box import ConcatenatedBox
-from sb3_chdp.common.rows import pack_bits
+from sb3_chdp.common.rows import best_values, pack_bits
 
 SelfHybridDistribution = TypeVar("SelfHybridDistribution", bound="HybridDistribution")
 
@@ -113,9 +113,18 @@ class HybridDistribution(DiagGaussianDistribution):
         """:return: (B, columns) rows of the most probable k and the means"""
         return self._rows(self.categorical.mode(), super().mode())
 
+    def most_probable(self, outputs: th.Tensor) -> th.Tensor:
+        """
+        :param outputs: (B, K + P) logits and means
+        :return: (B, columns) rows like :meth:`mode`, without masks and without the checks of a distribution, which no runtime
+            but Python knows
+        """
+        logits, means = outputs.split([self.n_logits, self.action_dim], dim=1)
+        return self._rows(best_values(logits, self.columns.radices), means)
+
     def _rows(self, k: th.Tensor, parameters: th.Tensor) -> th.Tensor:
         parts = {"discrete_actions": k, "parameters": parameters}
         if "masks" in self.columns:
-            free = th.ones(len(k), self.n_logits, dtype=th.bool, device=k.device)
+            free = th.ones(k.shape[0], self.n_logits, dtype=th.bool, device=k.device)
             parts["masks"] = pack_bits(free if self._masks is None else th.as_tensor(self._masks))
         return self.columns.pack(**parts)

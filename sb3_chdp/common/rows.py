@@ -73,7 +73,8 @@ class RowLayout:
         columns = {name: part[:, None] if part.ndim == 1 else part for name, part in parts.items()}
         first = next(iter(columns.values()))
         for name, place in self._slices.items():
-            shape = (len(first), place.stop - place.start)
+            # Not len(), at which torch.export would take the size of its example for the only one
+            shape = (first.shape[0], place.stop - place.start)
             if name not in columns:
                 columns[name] = first.new_zeros(shape) if isinstance(first, th.Tensor) else np.zeros(shape, first.dtype)
             assert columns[name].shape == shape, f"{name} must have shape {shape}, got {columns[name].shape}"

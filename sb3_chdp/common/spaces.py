@@ -130,7 +130,7 @@ class HybridActionSpec:
         index = np.where(mask, offsets[:-1, None] + np.arange(self.max_parameters), 0)
         # A shared layout has a single option that serves all K actions; in a factored one these are not to be counted
         shape = (1 if self.is_factored else self.n_discrete_actions, self.max_parameters)
-        self.mask, self._centre, self._half, self.parameter_index = (
+        self.mask, self.centre, self.half_range, self.parameter_index = (
             np.broadcast_to(table, shape) for table in (mask, centre, half, index)
         )
 
@@ -189,7 +189,7 @@ class HybridActionSpec:
             raise ValueError(f"{first} of a row must be in 0..{', 0..'.join(map(str, largest))}, got {choices}")
         scaled = np.clip(self.columns.view(rows, "parameters").astype(np.float64), -1.0, 1.0)
         options = self.options_of(choices)
-        values = self._centre[options] + self._half[options] * scaled
+        values = self.centre[options] + self.half_range[options] * scaled
         return [self._assemble(k, v) for k, v in zip(choices, values, strict=True)]
 
     def _assemble(self, k: Any, values: np.ndarray) -> Any:
@@ -238,8 +238,8 @@ class HybridActionSpec:
         option = 0 if self.is_shared else int(k[0])
         parameters = np.zeros(self.max_parameters)
         for box in self._boxes[option]:
-            values = np.ravel(get_part(action, box.path)).astype(np.float64) - self._centre[option, box.columns]
-            half = self._half[option, box.columns]
+            values = np.ravel(get_part(action, box.path)).astype(np.float64) - self.centre[option, box.columns]
+            half = self.half_range[option, box.columns]
             parameters[box.columns] = np.divide(values, half, out=np.zeros_like(values), where=half > 0)
         return self.columns.pack(discrete_actions=k[None], parameters=parameters[None])[0]
 

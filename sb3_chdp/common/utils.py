@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch as th
-from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
@@ -108,7 +107,7 @@ def nearest_row(points: th.Tensor, table: th.Tensor, masks: th.Tensor | None = N
     factors, squares = -2 * points, th.linalg.vecdot(table, table)
     if masks is not None:
         return th.addmm(squares, factors, table.t()).masked_fill(~masks, th.inf).min(dim=1).indices
-    if n_rows <= NEAREST_ROW_CHUNK:
+    if n_rows <= NEAREST_ROW_CHUNK or th.compiler.is_exporting():
         return th.addmm(squares, factors, table.t()).min(dim=1).indices
     # The distances to all rows of a large table do not fit into the processor's cache, and the place of a minimum takes
     # longer to find than its value: first the nearest group of rows, chunk by chunk, then the row within the group
@@ -126,20 +125,3 @@ def nearest_row(points: th.Tensor, table: th.Tensor, masks: th.Tensor | None = N
     rows = (group[:, None] * group_size + th.arange(group_size, device=table.device)).clamp(max=n_rows - 1)
     in_group = squares[rows] + th.bmm(table[rows], factors[:, :, None]).squeeze(2)
     return rows.gather(1, in_group.argmin(dim=1, keepdim=True)).squeeze(1)
-
-
-def hash_observations(observations: PyTorchObs) -> th.Tensor:
-    """
-    :param observations: batch of observations
-    :return: (B,) non-negative integers that depend on the content of each observation only
-    """
-    parts = observations.values() if isinstance(observations, dict) else [observations]
-    total: th.Tensor | int = 0
-    for part in parts:
-        flat = part.reshape(len(part), -1)
-        bits = flat.float().view(th.int32).long()
-        # Multiplicative hashing; products wrap around
-        factors = th.arange(1, flat.shape[1] + 1, device=flat.device) * 0x5851F42D4C957F2D + 1
-        total = total * 31 + (bits * factors).sum(dim=1)
-    assert isinstance(total, th.Tensor)
-    return (total ^ (total >> 29)).abs()

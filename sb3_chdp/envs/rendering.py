@@ -6,7 +6,7 @@ import numpy as np
 try:
     import pygame
 except ImportError as error:
-    raise gym.error.DependencyNotInstalled("Rendering needs pygame: pip install 'sb3-chdp[render]'") from error
+    raise gym.error.DependencyNotInstalled("Rendering needs pygame: pip install '.[render]' in a clone") from error
 
 Colour = tuple[int, int, int]
 Position = tuple[float, float]

@@ -4,7 +4,7 @@ from typing import Any
 
 import torch as th
 from sb3_contrib.common.maskable.distributions import MaybeMasks
-from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_chdp.common.distributions import HybridDistribution
@@ -62,6 +62,9 @@ class HPPOPolicy(HybridPolicy, ActorCriticPolicy):
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False, action_masks: MaybeMasks = None) -> th.Tensor:
         """:return: (n, columns) rows"""
+        if deterministic and action_masks is None:
+            features = BasePolicy.extract_features(self, observation, self.pi_features_extractor)
+            return self.action_dist.most_probable(self.action_net(self.mlp_extractor.forward_actor(features)))
         return self.get_distribution(observation, action_masks).get_actions(deterministic=deterministic)
 
 

@@ -244,7 +244,7 @@ class FactoredActionRepresentation(ActionRepresentation):
         return self.tables.nearest(embeddings, masks, th.tanh(self.tables.vectors))
 
     def mask_of(self, k: th.Tensor) -> th.Tensor:
-        return self.parameter_mask.expand(len(k), -1)
+        return self.parameter_mask.expand(k.shape[0], -1)
 
     def per_column(self, per_action: th.Tensor) -> th.Tensor:
         return per_action[:, self.tables.choice_of_slot]

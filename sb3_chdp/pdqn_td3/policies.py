@@ -136,8 +136,8 @@ class ParameterizedQNetwork(BaseModel):
     def _multi_pass(self, features: th.Tensor, parameters: th.Tensor, k: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """:return: (B, M) values of the (B, M) or (1, M) actions k, each computed from its own parameters"""
         columns = self.parameter_index[k]
-        index = columns.flatten(1).expand(len(parameters), -1)
-        own_parameters = parameters.gather(1, index).view(len(parameters), *columns.shape[1:]) * self.parameter_mask[k]
+        index = columns.flatten(1).expand(parameters.shape[0], -1)
+        own_parameters = parameters.gather(1, index).view(parameters.shape[0], *columns.shape[1:]) * self.parameter_mask[k]
         values = []
         for q_net in self.q_networks:
             first, *hidden, last = q_net.children()

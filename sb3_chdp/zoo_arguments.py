@@ -1,0 +1,153 @@
+"""Arguments of the command line: what users need not say, and hints about what they said."""
+
+import difflib
+import importlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import gymnasium as gym
+
+# rl_zoo3's default of train; the last run of it is looked for if no folder is named
+LOGS = "logs"
+STOCK = "sb3:"
+HELP = {"-h", "--help"}
+
+
+class Names(NamedTuple):
+    """How a script spells its options, the first spelling being the one that is added."""
+
+    folder: tuple[str, ...]
+    algo: tuple[str, ...]
+    env: tuple[str, ...]
+    exp_id: tuple[str, ...] = ()
+
+
+_MODEL = Names(("-f", "--folder"), ("--algo",), ("--env",), ("--exp-id",))
+# Scripts that read a run which was trained before
+READERS = {
+    "enjoy": _MODEL,
+    "record": _MODEL,
+    "record_training": _MODEL,
+    "push_to_hub": _MODEL,
+    "plot": Names(("-f", "--exp-folder"), ("-a", "--algo"), ("-e", "--env")),
+    "all_plots": Names(("-f", "--exp-folders"), ("-a", "--algos"), ("-e", "--env")),
+}
+
+
+class ArgumentsError(ValueError):
+    """What the user wrote cannot be done; the message says why."""
+
+
+def option(arguments: list[str], *names: str) -> str | None:
+    """:return: value of the first of the named options that is given, None if none is"""
+    for i, argument in enumerate(arguments):
+        name, _, value = argument.partition("=")
+        if name in names:
+            return value or (arguments[i + 1] if i + 1 < len(arguments) else "")
+    return None
+
+
+def split_option(arguments: list[str], name: str) -> tuple[list[str], list[str]]:
+    """
+    :param arguments: command line
+    :param name: an option with any number of values
+    :return: the other arguments, the values
+    """
+    rest, values, inside = [], [], False
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if key == name:
+            inside = True
+            values += [value] if value else []
+        elif inside and not argument.startswith("-"):
+            values.append(argument)
+        else:
+            inside = False
+            rest.append(argument)
+    return rest, values
+
+
+def unknown(kind: str, name: str, known: Iterable[str], hint: str) -> str:
+    """:return: message about a name that nobody knows, with the nearest one that somebody does"""
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f"unknown {kind} {name!r}{f', did you mean {close[0]}?' if close else ''} ({hint})"
+
+
+def import_packages(packages: Iterable[str]) -> None:
+    """
+    Let the user's modules register their environments.
+
+    :param packages: values of ``--gym-packages``
+    :raises ArgumentsError: if there is no such module
+    """
+    for package in packages:
+        try:
+            importlib.import_module(package)
+        except ModuleNotFoundError as error:
+            # A module that is missing inside the user's is an error of the user's, with its traceback
+            if error.name is None or not f"{package}.".startswith(f"{error.name}."):
+                raise
+            raise ArgumentsError(
+                f"--gym-packages: there is no module {package!r} in the current folder or among the installed packages"
+            ) from None
+
+
+def check_env(env_id: str | None) -> None:
+    """
+    :param env_id: an environment, None if the user named none
+    :raises ArgumentsError: if it is not registered
+    """
+    if not env_id:
+        raise ArgumentsError("--env says on which environment")
+    if env_id in gym.registry:
+        return
+    module, colon, name = env_id.partition(":")
+    if colon:
+        raise ArgumentsError(f"--env {env_id}: write --env {name} --gym-packages {module}")
+    hint = "--gym-packages names the module that registers it"
+    raise ArgumentsError(unknown("environment", env_id, gym.registry, hint))
+
+
+def complete(command: str, arguments: list[str]) -> list[str]:
+    """
+    Name the run that was trained last, of those in the folder ``logs`` that fit, where the user names no folder.
+
+    :param command: a key of ``READERS``
+    :param arguments: what the user wrote
+    :return: arguments that name folder, algorithm, environment and number of the run
+    :raises ArgumentsError: if there is no such run
+    """
+    names = READERS[command]
+    if option(arguments, *names.folder) is not None or HELP & set(arguments):
+        return arguments
+    algo, env = option(arguments, *names.algo), option(arguments, *names.env)
+    # Not the folders that a tuning leaves behind; those with checkpoints alone if the user asks for one
+    is_plot = not names.exp_id
+    any_file = is_plot or any(argument.startswith("--load-") for argument in arguments)
+    files = Path(LOGS).glob(
+        f"{(algo or '*').removeprefix(STOCK)}/{folder_name(env or '*')}_*/{'*.monitor.csv' if is_plot else '*.zip'}"
+    )
+    newest: tuple[float, Path] | None = None
+    for file in files:
+        env_name, _, number = file.parent.name.rpartition("_")
+        if number.isdigit() and (any_file or file.stem == env_name):
+            newest = max(newest or (0.0, file.parent), (file.stat().st_mtime, file.parent))
+    if newest is None:
+        words = ["no", not any_file and "finished", "run", algo and f"of {algo}", env and f"on {env}", "in"]
+        raise ArgumentsError(f"{' '.join(filter(None, words))} {LOGS}; -f names another folder")
+    run = newest[1]
+    env_name, _, number = run.name.rpartition("_")
+    added = [names.folder[0], LOGS]
+    if algo is None:
+        added += [names.algo[0], run.parent.name]
+    if env is None:
+        added += [names.env[0], next((known for known in gym.registry if folder_name(known) == env_name), env_name)]
+    if names.exp_id and option(arguments, *names.exp_id) is None:
+        added += [names.exp_id[0], number]
+    return [*added, *arguments]
+
+
+def folder_name(env_id: str) -> str:
+    """:return: an environment as rl_zoo3 names its folder"""
+    return env_id.replace("/", "-")

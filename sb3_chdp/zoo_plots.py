@@ -1,0 +1,63 @@
+"""rl_zoo3's plots as a picture, on machines without a display too."""
+
+import warnings
+from pathlib import Path
+
+import matplotlib
+from matplotlib import pyplot as plt
+from matplotlib.backend_bases import FigureCanvasBase
+
+from sb3_chdp.zoo_arguments import ArgumentsError, option, split_option
+
+OUTPUT = ("-o", "--output")
+HEADLESS = matplotlib.get_backend().lower() == "agg"
+
+
+def take_output(command: str, arguments: list[str]) -> tuple[list[str], Path | None]:
+    """
+    :param command: ``plot`` or ``all_plots``
+    :param arguments: what the user wrote
+    :return: arguments for rl_zoo3's script, and the picture that ``-o`` names
+    :raises ArgumentsError: for a file that is no picture
+    """
+    output = option(arguments, *OUTPUT)
+    if output is None:
+        return arguments, None
+    kinds = FigureCanvasBase.get_supported_filetypes()
+    if Path(output).suffix[1:] not in kinds:
+        if command == "all_plots":
+            # A table of numbers for plot_from_file
+            return [*arguments, "--no-display"] if HEADLESS else arguments, None
+        raise ArgumentsError(f"-o {output}: the name of a picture ends in {', '.join(f'.{kind}' for kind in sorted(kinds))}")
+    for name in OUTPUT:
+        arguments, _ = split_option(arguments, name)
+    matplotlib.use("Agg")
+    return arguments, Path(output)
+
+
+def show_as(path: Path | None) -> None:
+    """
+    Have ``plt.show`` write all figures: into the file itself, or several beside it, with their names.
+
+    :param path: the picture; None shows them as ever
+    :raises ArgumentsError: without a picture and without a display
+    """
+    if path is None:
+        if HEADLESS:
+            raise ArgumentsError("there is no display to show it on; -o FILE.png writes it into a file")
+        return
+
+    def save() -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        labels = plt.get_figlabels()
+        for label in labels:
+            figure = plt.figure(label)
+            if not any(axes.lines for axes in figure.axes):
+                raise ArgumentsError(f"{label}: nothing to plot, perhaps fewer episodes than -w of plot, 100 by default")
+            name = label.removeprefix("Results ").replace("/", "-")
+            picture = path if len(labels) == 1 else path.with_stem(f"{path.stem}-{name}")
+            figure.savefig(picture)
+            print(f"Saving to {picture}")
+
+    warnings.filterwarnings("ignore", "No artists with labels")
+    vars(plt).update(show=save)

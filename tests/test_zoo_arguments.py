@@ -1,0 +1,111 @@
+"""What the command line fills in, and what it says about mistakes."""
+
+import os
+import re
+
+import pytest
+
+from sb3_chdp.cli import COMMANDS, prepare_arguments
+from sb3_chdp.zoo_arguments import ArgumentsError, check_env, complete, import_packages, option, split_option
+
+
+@pytest.fixture
+def logs(tmp_path, monkeypatch):
+    """Runs in the order in which they were trained."""
+    monkeypatch.chdir(tmp_path)
+    files = ("chdp/Goal-v0_1/Goal-v0", "hppo/Goal-v0_9/Goal-v0", "hppo/Goal-v0_10/Goal-v0", "chdp/sb3_chdp-Platform-v0_2/")
+    for age, name in enumerate(files):
+        run = tmp_path / "logs" / os.path.dirname(name)
+        run.mkdir(parents=True)
+        # The last run is not finished
+        (run / "0.monitor.csv").touch()
+        for file in [run / "0.monitor.csv", run / (os.path.basename(name) or "rl_model_5_steps")]:
+            file = file.with_suffix(file.suffix or ".zip")
+            file.touch()
+            os.utime(file, (age, age))
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "added"),
+    [
+        ("enjoy", "", "-f logs --algo hppo --env Goal-v0 --exp-id 10"),
+        ("record", "--algo chdp -n 5", "-f logs --env Goal-v0 --exp-id 1"),
+        ("enjoy", "--algo=sb3:hppo --exp-id 9", "-f logs --env Goal-v0"),
+        ("enjoy", "--load-last-checkpoint", "-f logs --algo chdp --env sb3_chdp/Platform-v0 --exp-id 2"),
+        ("enjoy", "--load-best --env sb3_chdp/Platform-v0", "-f logs --algo chdp --exp-id 2"),
+        ("plot", "", "-f logs -a chdp -e sb3_chdp/Platform-v0"),
+        ("all_plots", "--env Goal-v0", "-f logs -a hppo"),
+        ("enjoy", "--folder elsewhere", ""),
+        ("enjoy", "--help", ""),
+    ],
+)
+def test_the_last_run(logs, command, arguments, added):
+    assert complete(command, arguments.split()) == [*added.split(), *arguments.split()]
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "message"),
+    [
+        ("enjoy", "--algo pa_td3", "no finished run of pa_td3 in logs; -f names another folder"),
+        ("record", "--env sb3_chdp/Platform-v0", "no finished run on sb3_chdp/Platform-v0 in logs"),
+        ("plot", "--env Other-v0", "no run on Other-v0 in logs"),
+    ],
+)
+def test_no_such_run(logs, command, arguments, message):
+    with pytest.raises(ArgumentsError, match=re.escape(message)):
+        complete(command, arguments.split())
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "prepared"),
+    [
+        ("train", "--algo sb3:sac --env Goal-v0", "--algo sac --env Goal-v0"),
+        ("enjoy", "--algo=sb3:sac -f logs", "--algo=sac -f logs"),
+        ("enjoy", "-f logs", "--algo chdp -f logs"),
+        ("plot", "-f logs -e sb3_chdp/Goal-v0", "-a chdp -f logs -e sb3_chdp-Goal-v0"),
+        ("all_plots", "-f logs -e Goal-v0 -a hppo sb3:sac", "-f logs -e Goal-v0 -a hppo sac"),
+        ("plot_from_file", "-i post.pkl", "-i post.pkl"),
+    ],
+)
+def test_algorithm(command, arguments, prepared):
+    assert prepare_arguments(command, arguments.split()) == prepared.split()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "message"),
+    [
+        ("Platfrom-v0", "unknown environment 'Platfrom-v0', did you mean Platform-v0? (--gym-packages names"),
+        ("Qwx-v0", "unknown environment 'Qwx-v0' (--gym-packages names"),
+        ("mine:Own-v0", "--env mine:Own-v0: write --env Own-v0 --gym-packages mine"),
+        (None, "--env says on which environment"),
+    ],
+)
+def test_unknown_environment(env_id, message):
+    with pytest.raises(ArgumentsError, match=re.escape(message)):
+        check_env(env_id)
+
+
+def test_known_environment():
+    check_env("Platform-v0")
+    check_env("sb3_chdp/Platform-v0")
+
+
+def test_modules(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "module_with_a_hole.py").write_text("import not_there_at_all")
+    with pytest.raises(ArgumentsError, match="there is no module 'not_there_either'"):
+        import_packages(["not_there_either"])
+    with pytest.raises(ModuleNotFoundError, match="not_there_at_all"):
+        import_packages(["module_with_a_hole"])
+
+
+def test_options():
+    arguments = "--env A --gym-packages a b -n 5 --gym-packages=c --algo=x".split()
+    assert split_option(arguments, "--gym-packages") == ("--env A -n 5 --algo=x".split(), ["a", "b", "c"])
+    assert option(arguments, "--algo") == "x" and option(arguments, "-n") == "5" and option(arguments, "-f") is None
+
+
+def test_every_command_is_listed():
+    from sb3_chdp import cli
+
+    assert all(f"sb3-chdp {command}" in cli.__doc__ or f"| {command}" in cli.__doc__ for command in COMMANDS)
