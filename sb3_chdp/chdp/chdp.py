@@ -107,8 +107,6 @@ class CHDP(HybridOffPolicyAlgorithm):
     uniform_fraction: ClassVar[float] = 0.5
     # Whether the critics' loss trains the codebook
     critics_train_codebook: ClassVar[bool] = True
-    # Whether the policies imitate only those replayed actions that the critics value no less than the policies' own
-    filters_actions: ClassVar[bool] = True
     # Bound on the gradient norm of every network
     max_grad_norm: ClassVar[float | None] = None
 
@@ -250,17 +248,14 @@ class CHDP(HybridOffPolicyAlgorithm):
 
                 # Step 1: discrete policy, eq. 7
                 parameters = self._parameters_of_latents(replay_data)
-                rivals = q_values if self.filters_actions else None
-                diffusion_loss, q_loss, counts = discrete_policy_loss(policy, replay_data, features, parameters, rivals)
+                diffusion_loss, q_loss = discrete_policy_loss(policy, replay_data, features, parameters)
                 loss = diffusion_loss + alpha * q_loss
                 gradient_step(loss, [policy.discrete_optimizer], self.max_grad_norm, "discrete_loss")
                 losses |= {"discrete_loss": loss, "diffusion_loss_discrete": diffusion_loss}
-                if counts is not None:
-                    losses["imitation_rate"] = counts.mean()
 
                 # Step 2: continuous policy and codebook, eq. 8, given the updated discrete policy
                 latents, k = self._actions_to_improve(replay_data, features)
-                diffusion_loss, q_loss = continuous_policy_loss(policy, replay_data, features, latents, k, counts)
+                diffusion_loss, q_loss = continuous_policy_loss(policy, replay_data, features, latents, k)
                 loss = diffusion_loss + alpha * q_loss
                 optimizers = [policy.continuous_optimizer, policy.codebook_optimizer]
                 gradient_step(loss, optimizers, self.max_grad_norm, "continuous_loss")

@@ -135,27 +135,20 @@ class DiffusionModel(nn.Module):
                 x = x * mask
         return x
 
-    def diffusion_loss(
-        self, x_start: th.Tensor, condition: th.Tensor, mask: th.Tensor | None = None, weights: th.Tensor | None = None
-    ) -> th.Tensor:
+    def diffusion_loss(self, x_start: th.Tensor, condition: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
         """
         L_d of the paper's eq. 2: mean squared error of the predicted noise at uniformly random steps.
 
         :param x_start: (B, dim) clean samples
         :param condition: (B, condition_dim)
         :param mask: (B, dim) 1 for the entries that exist, None if all do
-        :param weights: (B, 1) of the samples, None if all count alike
         """
         i = th.randint(self.n_steps, (len(x_start),), device=x_start.device)
         noise = th.randn_like(x_start)
         signal, spread = self.levels[:, i, None]
         x = signal * x_start + spread * noise
         by_condition, by_step = self.noise_predictor.contexts(condition)
-        if mask is None and weights is None:
-            return F.mse_loss(self.noise_predictor(x, by_condition + by_step[i]), noise)
         if mask is None:
-            mask = th.ones_like(x)
+            return F.mse_loss(self.noise_predictor(x, by_condition + by_step[i]), noise)
         errors = self.noise_predictor(x * mask, by_condition + by_step[i]) - noise
-        if weights is not None:
-            mask = mask * weights
         return (errors.square() * mask).sum() / mask.sum().clamp(min=1)

@@ -58,12 +58,8 @@ def critic_loss(
 
 
 def discrete_policy_loss(
-    policy: CHDPPolicy,
-    replay_data: HybridReplaySamples,
-    features: th.Tensor,
-    parameters: th.Tensor | None = None,
-    stored_q_values: th.Tensor | None = None,
-) -> tuple[th.Tensor, th.Tensor, th.Tensor | None]:
+    policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, parameters: th.Tensor | None = None
+) -> tuple[th.Tensor, th.Tensor]:
     """
     Eq. 7, L_d - alpha Q1(s, e, a): Q of latents e drawn through the whole chain.
 
@@ -71,28 +67,19 @@ def discrete_policy_loss(
     :param replay_data: a batch
     :param features: (B, features_dim) features of the observations, without gradient
     :param parameters: (B, Pmax) parameters a of the drawn latents; None: those that the continuous policy draws for them
-    :param stored_q_values: (B, 1) Q1 of the stored actions, of which then only those count in L_d that are valued no less than
-        the drawn ones; None: all count
-    :return: diffusion loss L_d, policy improvement loss -Q1, and (B, 1) which of the stored actions count, None if all do
+    :return: diffusion loss L_d and policy improvement loss -Q1
     """
     actor = policy.actor
     latents = actor.discrete_policy.sample(features)
     if parameters is None:
         with th.no_grad():
             parameters = actor.sample_parameters(features, actor.codebook.quantize(latents, replay_data.masks))
-    q_values = policy.critic.q1_values(features, latents, parameters)
-    counts = None if stored_q_values is None else (stored_q_values >= q_values.detach()).float()
-    diffusion_loss = actor.discrete_policy.diffusion_loss(replay_data.latents, features, weights=counts)
-    return diffusion_loss, -q_values.mean(), counts
+    diffusion_loss = actor.discrete_policy.diffusion_loss(replay_data.latents, features)
+    return diffusion_loss, -policy.critic.q1_values(features, latents, parameters).mean()
 
 
 def continuous_policy_loss(
-    policy: CHDPPolicy,
-    replay_data: HybridReplaySamples,
-    features: th.Tensor,
-    latents: th.Tensor,
-    k: th.Tensor,
-    counts: th.Tensor | None = None,
+    policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, latents: th.Tensor, k: th.Tensor
 ) -> tuple[th.Tensor, th.Tensor]:
     """
     Eq. 8, L_d - alpha Q1(s, e, a): Q of parameters a drawn through the whole chain; the gradient reaches the codebook through
@@ -103,11 +90,10 @@ def continuous_policy_loss(
     :param features: (B, features_dim) features of the observations, without gradient
     :param latents: (B, latent_dim) latents e, without gradient
     :param k: (B,) discrete actions that they decode to
-    :param counts: (B, 1) which of the stored actions count in L_d, None if all do
     :return: diffusion loss L_d and policy improvement loss -Q1
     """
     actor, stored_k = policy.actor, replay_data.discrete_actions
     condition = actor.condition(features, actor.codebook(stored_k).detach())
-    diffusion_loss = actor.continuous_policy.diffusion_loss(replay_data.parameters, condition, actor.mask(stored_k), counts)
+    diffusion_loss = actor.continuous_policy.diffusion_loss(replay_data.parameters, condition, actor.mask(stored_k))
     parameters = actor.sample_parameters(features, k)
     return diffusion_loss, -policy.critic.q1_values(features, latents, parameters).mean()

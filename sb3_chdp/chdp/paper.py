@@ -123,7 +123,6 @@ class PaperCHDP(CHDP):
     }
     uniform_fraction: ClassVar[float] = 0.0
     critics_train_codebook: ClassVar[bool] = False
-    filters_actions: ClassVar[bool] = False
     max_grad_norm: ClassVar[float | None] = 1.0
 
     def __init__(

@@ -147,13 +147,9 @@ class CHDPPolicy(HybridPolicy):
     def _make_selections(self) -> tuple[Selection, Selection, Selection]:
         """:return: rules for acting, for deterministic predictions and for next actions"""
         spec = self.action_space.spec
-        n_alternatives = min(sum(spec.radices), MAX_ALTERNATIVES)
-        if spec.is_factored:
-            drawn = Selection(self.n_action_candidates, n_changed=n_alternatives)
-        else:
-            drawn = Selection(self.n_action_candidates, n_uniform=n_alternatives)
-        acting = replace(drawn, n_random=N_RANDOM_CANDIDATES)
-        return acting, replace(drawn, n_refined=N_REFINEMENT_CANDIDATES), Selection(n_drawn=1)
+        changes = {"n_changed" if spec.is_factored else "n_uniform": min(sum(spec.radices), MAX_ALTERNATIVES)}
+        acting = Selection(self.n_action_candidates, n_random=N_RANDOM_CANDIDATES, **changes)
+        return acting, replace(acting, n_refined=N_REFINEMENT_CANDIDATES), Selection(n_drawn=1)
 
     def _make_optimizer(self, network: nn.Module, lr_schedule: Schedule) -> th.optim.Optimizer:
         parameters = list(network.parameters())
