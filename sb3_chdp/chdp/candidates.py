@@ -30,6 +30,22 @@ class SelectedActions(NamedTuple):
     q_values: th.Tensor
 
 
+class FixedDraws(NamedTuple):
+    """
+    What takes the place of everything random, so that a prediction can be repeated.
+
+    :ivar latent_noise: (N, B * n_drawn, latent_dim) noise of the discrete policy's chains
+    :ivar parameter_noise: (N, B * (n_drawn + n_uniform), Pmax) noise of the continuous policy's chains
+    :ivar discrete_actions: (n_random, ...) those of the random actions, which are the same for all observations
+    :ivar parameters: (n_random, Pmax) their parameters, padding 0
+    """
+
+    latent_noise: th.Tensor
+    parameter_noise: th.Tensor
+    discrete_actions: th.Tensor
+    parameters: th.Tensor
+
+
 class Candidates(NamedTuple):
     """
     n hybrid actions for each of B observations.
@@ -70,7 +86,7 @@ def drawn_candidates(
     features: th.Tensor,
     n: int,
     n_uniform: int,
-    noise: tuple[th.Tensor, th.Tensor] | None = None,
+    fixed: FixedDraws | None = None,
     masks: th.Tensor | None = None,
 ) -> Candidates:
     """
@@ -80,35 +96,35 @@ def drawn_candidates(
     :param features: (B, features_dim) features of the observations
     :param n: number of actions per observation that both policies draw
     :param n_uniform: number of further discrete actions, see :meth:`Codebook.alternatives`
-    :param noise: noises of the chains of latents (N, B * n, latent_dim) and of parameters (N, B * (n_uniform + n), Pmax);
-        None: draw
+    :param fixed: what to take for all that is random; None: draw
     :param masks: (B, K) False for discrete actions that the discrete policy may not draw, None if it may draw all
     """
     # Not len(), at which torch.export would take the size of its example for the only one
     batch_size, codebook = features.shape[0], actor.codebook
-    latent_noise, parameter_noise = (None, None) if noise is None else noise
+    latent_noise, parameter_noise = (None, None) if fixed is None else fixed[:2]
     masks = None if masks is None else masks.repeat_interleave(n, dim=0)
     latents, k = actor.sample_latents(features.repeat_interleave(n, dim=0), latent_noise, masks)
     latents, k = latents.unflatten(0, (batch_size, n)), k.unflatten(0, (batch_size, n))
     if n_uniform > 0:
-        uniform_k = codebook.alternatives(k[:, 0], n_uniform, noise is not None)
+        uniform_k = codebook.alternatives(k[:, 0], n_uniform, fixed is not None)
         latents, k = th.cat([codebook.representative_latents(uniform_k), latents], dim=1), th.cat([uniform_k, k], dim=1)
     parameters = actor.sample_parameters(features.repeat_interleave(n + n_uniform, dim=0), k.flatten(0, 1), parameter_noise)
     return Candidates(latents, k, parameters.view(batch_size, n + n_uniform, -1))
 
 
-def random_candidates(actor: CooperativeActor, batch_size: int, n: int, repeatable: bool) -> Candidates:
+def random_candidates(actor: CooperativeActor, batch_size: int, n: int, fixed: FixedDraws | None) -> Candidates:
     """
     Uniformly random actions.
 
     :param actor: the policies, whose codewords are the latents
     :param batch_size: number B of observations
     :param n: number of actions per observation
-    :param repeatable: whether to return the same actions always, for all observations (B = 1)
+    :param fixed: what to take instead, for all observations (B = 1)
     """
-    if repeatable:
-        return Candidates(*actor.random_actions(1, n, generator=th.Generator().manual_seed(0)))
-    return Candidates(*actor.random_actions(batch_size, n))
+    if fixed is None:
+        return Candidates(*actor.random_actions(batch_size, n))
+    k, parameters = fixed.discrete_actions[None], fixed.parameters[None]
+    return Candidates(actor.codebook.representative_latents(k), k, parameters)
 
 
 def changed_candidates(actor: CooperativeActor, actions: SelectedActions, n: int, repeatable: bool) -> Candidates:
@@ -180,27 +196,26 @@ class Selection:
         actor: CooperativeActor,
         critic: HybridCritic,
         features: th.Tensor,
-        noise: tuple[th.Tensor, th.Tensor] | None = None,
+        fixed: FixedDraws | None = None,
         masks: th.Tensor | None = None,
     ) -> SelectedActions:
         """
         :param actor: the policies
         :param critic: the critics that choose
         :param features: (B, features_dim) features of the observations
-        :param noise: all that is random in the draws, see :func:`drawn_candidates`; random actions are the same every time
-            then. None: draw
+        :param fixed: what to take for all that is random; None: draw
         :param masks: (B, K) False for discrete actions that may not be taken, None if all may
         """
 
         def allowed(candidates: Candidates) -> th.Tensor | None:
             return None if masks is None else actor.codebook.allowed(candidates.discrete_actions, masks)
 
-        candidates = drawn_candidates(actor, features, self.n_drawn, self.n_uniform, noise, masks)
+        candidates = drawn_candidates(actor, features, self.n_drawn, self.n_uniform, fixed, masks)
         if self.n_random > 0:
-            candidates = candidates.join(random_candidates(actor, features.shape[0], self.n_random, noise is not None))
+            candidates = candidates.join(random_candidates(actor, features.shape[0], self.n_random, fixed))
         best = candidates.best(critic, features, allowed(candidates))
         if self.n_changed > 0:
-            candidates = changed_candidates(actor, best, self.n_changed, noise is not None)
+            candidates = changed_candidates(actor, best, self.n_changed, fixed is not None)
             best = candidates.best(critic, features, allowed(candidates))
         for spread in REFINEMENT_SPREADS if self.n_refined > 0 else ():
             best = varied_candidates(actor, best, self.n_refined, spread).best(critic, features)

@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 
 from sb3_chdp.chdp.actor import CooperativeActor
-from sb3_chdp.chdp.candidates import Selection
+from sb3_chdp.chdp.candidates import FixedDraws, Selection
 from sb3_chdp.chdp.codebook import Codebook
 from sb3_chdp.chdp.critic import BilinearReads, HybridCritic, QNetwork
 from sb3_chdp.chdp.diffusion import DiffusionModel
@@ -59,6 +59,8 @@ class CHDPPolicy(HybridPolicy):
     :param n_action_candidates: number of actions drawn per observation, that of :class:`CHDP`
     """
 
+    fixed_discrete_actions: th.Tensor
+    fixed_parameters: th.Tensor
     # Whether the units of the critics follow the rewards, see ValueScale
     adapts_values: ClassVar[bool] = True
 
@@ -114,6 +116,12 @@ class CHDPPolicy(HybridPolicy):
         self.continuous_optimizer = self._make_optimizer(continuous, lr_schedule)
         self.critic.optimizer = self._make_optimizer(self.critic, lr_schedule)
         self.codebook_optimizer = self._make_optimizer(actor.codebook, lr_schedule)
+
+        # Random actions of deterministic predictions, the same for every model
+        n_random, generator = self.select_deterministic.n_random, th.Generator().manual_seed(0)
+        _, k, parameters = actor.random_actions(n_random, generator=generator)
+        self.register_buffer("fixed_discrete_actions", k, persistent=False)
+        self.register_buffer("fixed_parameters", parameters, persistent=False)
 
     def _make_critic(self, extractor: BaseFeaturesExtractor) -> HybridCritic:
         latent_dim, n_parameters = self.action_space.latent_dim, self.action_space.spec.max_parameters
@@ -172,14 +180,14 @@ class CHDPPolicy(HybridPolicy):
         """
         features = self.critic_target.features(observation)
         if deterministic:
-            select, actor, noise = self.select_deterministic, self.actor_target, self._noise_of(observation)
+            select, actor, fixed = self.select_deterministic, self.actor_target, self._fixed_draws(observation)
         else:
-            select, actor, noise = self.select, self.actor, None
-        latents, k, parameters, _ = select(actor, self.critic_target, features, noise, action_masks)
+            select, actor, fixed = self.select, self.actor, None
+        latents, k, parameters, _ = select(actor, self.critic_target, features, fixed, action_masks)
         return self.action_space.columns.pack(discrete_actions=k.float(), parameters=parameters, latents=latents)
 
-    def _noise_of(self, observation: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
-        """:return: noise of both policies' chains in deterministic predictions, the same for every model"""
+    def _fixed_draws(self, observation: PyTorchObs) -> FixedDraws:
+        """:return: what deterministic predictions take for all that is random, the same for every model"""
         n_drawn, n_uniform = self.select_deterministic.n_drawn, self.select_deterministic.n_uniform
         latent_noise, parameter_noise = (
             repeatable_noise(observation, n, model.n_steps, model.dim, seed=seed).flatten(0, 1).transpose(0, 1)
@@ -188,7 +196,7 @@ class CHDPPolicy(HybridPolicy):
                 (n_drawn + n_uniform, self.actor_target.continuous_policy, 2),
             )
         )
-        return latent_noise, parameter_noise
+        return FixedDraws(latent_noise, parameter_noise, self.fixed_discrete_actions, self.fixed_parameters)
 
     def random_rows(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
         """Uniformly random actions; their latents scatter around the codewords and decode to the actions."""
