@@ -165,7 +165,7 @@ class CHDPPolicy(HybridPolicy):
         """
         if deterministic and self.select_deterministic.n_refined > 0 and th.compiler.is_exporting():
             raise NotImplementedError(
-                "CHDP cannot be exported yet: refined actions are so close in value that rounding chooses, which differs elsewhere"
+                "CHDP cannot be exported yet: refined actions are so close in value that a runtime's rounding chooses"
             )
         features = self.critic_target.features(observation)
         if deterministic:
