@@ -17,7 +17,8 @@ from tests.hybrid_envs import LayoutEnv, box, layouts, make_layout_env
 ort = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
-ALGORITHMS = ["CHDP", "PaperCHDP", "HPPO", "PATD3", "PDQNTD3", "HHQNTD3", "HyARTD3"]
+ALGORITHMS = ["PaperCHDP", "HPPO", "PATD3", "PDQNTD3", "HHQNTD3", "HyARTD3"]
+WAITING = pytest.mark.xfail(strict=True, raises=NotImplementedError, reason="rounding chooses among refined actions")
 N = 1_000
 PAGE = Path(__file__).parent.parent / "docs" / "guide" / "export.md"
 FACTORED = spaces.Tuple((spaces.MultiDiscrete([40, 3, 30]), box(-1, 1, 2)))
@@ -73,7 +74,7 @@ def check(model, tmp_path, n=N):
         np.testing.assert_allclose((np.asarray(parameters) - spec.centre[options]) / half, own_parameters, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("name", [*ALGORITHMS, pytest.param("CHDP", marks=WAITING)])
 def test_every_algorithm(name, tmp_path):
     check(getattr(sb3_chdp, name)("MlpPolicy", make_layout_env("flat"), seed=1), tmp_path)
 

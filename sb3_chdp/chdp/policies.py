@@ -178,6 +178,10 @@ class CHDPPolicy(HybridPolicy):
 
         :return: (B, columns) rows
         """
+        if deterministic and self.select_deterministic.n_refined > 0 and th.compiler.is_exporting():
+            raise NotImplementedError(
+                "CHDP cannot be exported yet: refined actions are so close in value that a runtime's rounding chooses"
+            )
         features = self.critic_target.features(observation)
         if deterministic:
             select, actor, fixed = self.select_deterministic, self.actor_target, self._fixed_draws(observation)

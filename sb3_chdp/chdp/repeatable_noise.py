@@ -50,6 +50,12 @@ def repeatable_uniform(observations: PyTorchObs, *shape: int, seed: int = 0) -> 
     :param seed: another one gives unrelated numbers
     :return: (B, *shape) float32 numbers in [0, 1)
     """
+    values = _fractions(observations, math.prod(shape), seed)
+    return values.float().clamp(max=BELOW_ONE).reshape(-1, *shape)
+
+
+def _fractions(observations: PyTorchObs, n_values: int, seed: int) -> th.Tensor:
+    """:return: (B, n_values) float64 numbers in [0, 1)"""
     parts = observations.values() if isinstance(observations, dict) else [observations]
     entries = th.cat([part.reshape(part.shape[0], -1).double() for part in parts], dim=1)
     scaled = entries.sign() * (1 + entries.abs() / SMALL_ENTRY).log()
@@ -57,8 +63,7 @@ def repeatable_uniform(observations: PyTorchObs, *shape: int, seed: int = 0) -> 
     phases = _fraction(scaled @ frequencies[1:] + frequencies[0])
     others = th.cat([phases[:, 1:], phases[:, :1]], dim=1)
     phases = _fraction(phases + MIXING * (FULL_TURN * others).sin())
-    values = _fraction(phases @ th.as_tensor(_value_frequencies(math.prod(shape), seed), device=entries.device))
-    return values.float().clamp(max=BELOW_ONE).reshape(-1, *shape)
+    return _fraction(phases @ th.as_tensor(_value_frequencies(n_values, seed), device=entries.device))
 
 
 def _fraction(numbers: th.Tensor) -> th.Tensor:
@@ -77,8 +82,9 @@ def repeatable_noise(observations: PyTorchObs, *shape: int, seed: int = 0) -> th
     :return: (B, *shape) float32 noise
     """
     n_pairs = math.ceil(math.prod(shape) / 2)
-    radii, angles = repeatable_uniform(observations, 2, n_pairs, seed=seed).unbind(dim=1)
+    radii, angles = _fractions(observations, 2 * n_pairs, seed).split(n_pairs, dim=1)
     radii = (-2 * radii.clamp(min=SMALLEST).log()).sqrt()
-    angles = FULL_TURN * angles
-    noise = th.cat([radii * angles.cos(), radii * angles.sin()], dim=1)
-    return noise[:, : math.prod(shape)].reshape(-1, *shape)
+    # Not all runtimes know the cosine of 64-bit floats
+    angles = th.cat([angles + 0.25, angles], dim=1)
+    noise = th.cat([radii, radii], dim=1) * (FULL_TURN * angles).sin()
+    return noise[:, : math.prod(shape)].float().reshape(-1, *shape)

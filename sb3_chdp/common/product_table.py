@@ -68,11 +68,11 @@ class ProductTable(nn.Module):
         """
         vectors = self.vectors if vectors is None else vectors
         n_choices, _, block_width = vectors.shape
-        blocks = points.new_zeros(len(points), n_choices * block_width)
+        blocks = points.new_zeros(points.shape[0], n_choices * block_width)
         blocks[:, self.slots] = points
         # |p - v|^2 without |p|^2, which is the same for all values
         distances = vectors.square().sum(dim=2) - 2 * th.einsum(
-            "bld,lrd->blr", blocks.view(len(points), n_choices, block_width), vectors
+            "bld,lrd->blr", blocks.view(-1, n_choices, block_width), vectors
         )
         allowed = self.exists if masks is None else self.exists & masks[:, self.places]
         return distances.masked_fill(~allowed, th.inf).argmin(dim=2)
