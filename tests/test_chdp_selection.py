@@ -5,7 +5,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_chdp.chdp.candidates import Selection
+from sb3_chdp.chdp.candidates import FixedDraws, Selection
 from tests.algorithms import calls_of, filled_model
 from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, make_layout_env
 
@@ -38,13 +38,14 @@ def near(value):
     return lambda features, latents, parameters: -(parameters[:, :1] - value).abs()
 
 
-def fixed_noise(actor, batch_size, select):
-    """Noise of all chains that a selection draws."""
+def fixed_draws(actor, batch_size, select):
+    """All that is random in a selection."""
     n_latents, n_parameters = batch_size * select.n_drawn, batch_size * (select.n_drawn + select.n_uniform)
     latents, parameters = actor.discrete_policy, actor.continuous_policy
-    return (
+    return FixedDraws(
         th.randn(latents.n_steps, n_latents, latents.dim),
         th.randn(parameters.n_steps, n_parameters, parameters.dim),
+        *actor.random_actions(select.n_random)[1:],
     )
 
 
@@ -81,12 +82,12 @@ def test_the_best_of_all_candidates_is_taken(actor, select):
 
 
 @SELECTIONS
-def test_with_given_noise_the_choice_repeats(actor, select):
+def test_with_fixed_draws_the_choice_repeats(actor, select):
     features, critic = random_features(actor, 5), Critic(near(0.3))
-    noise = fixed_noise(actor, 5, select)
-    first, second, other = (select(actor, critic, features, n) for n in (noise, noise, fixed_noise(actor, 5, select)))
+    fixed = fixed_draws(actor, 5, select)
+    first, second, other = (select(actor, critic, features, n) for n in (fixed, fixed, fixed_draws(actor, 5, select)))
     assert all(th.equal(a, b) for a, b in zip(first, second, strict=True))
-    assert (first.parameters != other.parameters).any() or select.n_random > 0
+    assert (first.parameters != other.parameters).any()
     free = [select(actor, critic, features).parameters for _ in range(2)]
     assert (free[0] != free[1]).any()
 
@@ -129,7 +130,7 @@ def test_refinement():
     actor, mask = model.actor, th.as_tensor(np.array(model.hybrid_space.spec.mask)).bool()
     assert not mask.all()
     features = random_features(actor, 50)
-    noise, critic = fixed_noise(actor, 50, Selection(1)), Critic(near(0.7))
+    noise, critic = fixed_draws(actor, 50, Selection(1)), Critic(near(0.7))
     plain = Selection(1)(actor, critic, features, noise)
     refined = Selection(1, n_refined=32)(actor, critic, features, noise)
     assert th.equal(plain.discrete_actions, refined.discrete_actions) and th.equal(plain.latents, refined.latents)
