@@ -134,7 +134,7 @@ def complete(command: str, arguments: list[str]) -> list[str]:
         if number.isdigit() and (any_file or file.stem == env_name):
             newest = max(newest or (0.0, file.parent), (file.stat().st_mtime, file.parent))
     if newest is None:
-        words = ["no", not any_file and "finished", "run", algo and f"of {algo}", env and f"on {env}", "in"]
+        words = ["no", "" if any_file else "finished", "run", f"of {algo}" if algo else "", f"on {env}" if env else "", "in"]
         raise ArgumentsError(f"{' '.join(filter(None, words))} {LOGS}; -f names another folder")
     run = newest[1]
     env_name, _, number = run.name.rpartition("_")

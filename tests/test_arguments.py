@@ -120,7 +120,7 @@ def test_a_gpu_that_is_not_there(algorithm, device, tmp_path):
      dict(device=th.device("cpu")), dict(max_grad_norm=0.1), dict(batch_size=np.int32(4)), dict(train_freq=(2, "episode")),
      dict(gradient_steps=-1), dict(gradient_steps=0), dict(tau=1.0), dict(exploration_fraction=0.0), dict(seed=None),
      dict(learning_rate=lambda progress: 1e-3 * progress), dict(clip_range_vf=0.2), dict(exploration_initial_noise=1.0)],
-    ids=str,
+    ids=lambda kwargs: "-".join(kwargs),
 )  # fmt: skip
 def test_good_values(algorithm, kwargs):
     if {*kwargs} <= {*constructor_defaults(algorithm)}:

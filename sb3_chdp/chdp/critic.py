@@ -100,10 +100,10 @@ class QNetwork(nn.Module):
     @th.no_grad()
     def rescale(self, factor: float, summand: float) -> None:
         """Multiply the values by a factor and add a number."""
-        for net in (self.value, self.advantage):
-            net[-1].weight.mul_(factor)
-            net[-1].bias.mul_(factor)
-        self.value[-1].bias.add_(summand)
+        for parameter in (*self.value[-1].parameters(), *self.advantage[-1].parameters()):
+            parameter.mul_(factor)
+        *_, bias = self.value[-1].parameters()
+        bias.add_(summand)
 
 
 class HybridCritic(BaseModel):
@@ -154,4 +154,5 @@ class HybridCritic(BaseModel):
     def rescale(self, factor: float, summand: float) -> None:
         """Multiply the values by a factor and add a number."""
         for q_net in self.q_networks:
+            assert isinstance(q_net, QNetwork)
             q_net.rescale(factor, summand)
