@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import PaperCHDP
-from sb3_chdp.common.buffers import PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
 from tests.algorithms import calls_of, fast_model, filled_model, has_learnt, sample, snapshot
 from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, make_layout_env
 
@@ -109,28 +107,6 @@ def test_two_seeded_runs_are_identical():
     first, second, other = parameters(), parameters(), parameters(seed=1)
     assert all(th.equal(first[name], second[name]) for name in first)
     assert any((first[name] != other[name]).any() for name in first)
-
-
-def test_replay_is_prioritised_where_it_can_be():
-    dict_env = make_layout_env(observation_space=spaces.Dict(vector=box(-1, 1, 2)))
-    assert type(fast_model().replay_buffer) is PrioritizedReplayBuffer
-    assert type(CHDP("MultiInputPolicy", dict_env, buffer_size=100).replay_buffer) is PrioritizedDictReplayBuffer
-    assert type(fast_model(n_steps=3).replay_buffer) is NStepReplayBuffer
-    own = fast_model(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False))
-    assert type(own.replay_buffer) is ReplayBuffer
-    assert type(fast_model(replay_buffer_class=ReplayBuffer).replay_buffer) is ReplayBuffer
-
-
-OPTIONS = [
-    {},
-    dict(n_action_candidates=1),
-    dict(n_diffusion_steps=1),
-    dict(policy_delay=1),
-    dict(replay_buffer_class=ReplayBuffer),
-    dict(n_steps=3),
-    dict(latent_dim=1),
-    dict(policy_kwargs=dict(net_arch=dict(pi=[16], qf=[16]), activation_fn=th.nn.ReLU, optimizer_class=th.optim.AdamW)),
-]
 
 
 @pytest.mark.parametrize("algorithm_class, kwargs", [*((CHDP, kwargs) for kwargs in OPTIONS), (PaperCHDP, {})], ids=str)

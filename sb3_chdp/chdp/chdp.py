@@ -4,7 +4,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
@@ -17,7 +16,7 @@ from sb3_chdp.chdp.exploration import exploration_rate, vary_parts
 from sb3_chdp.chdp.losses import continuous_policy_loss, critic_loss, discrete_policy_loss, relabel_latents, target_values
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_chdp.common.arguments import Accepted, number, of_networks, warn_of_cost, whole
-from sb3_chdp.common.buffers import PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
+from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.product_table import block_widths
@@ -47,13 +46,12 @@ class CHDP(HybridOffPolicyAlgorithm):
         2. critics have layer normalisation, a state value of their own and bilinear reads, see :class:`QNetwork`;
         3. the critics' loss trains the codebook too, so that actions of similar effect get similar codewords; latents from
            the buffer that no longer decode to the action taken give way to its present codeword, see ``train/latent_drift``;
-        4. of several actions the one of highest Q acts, and of two next actions the better counts, see :class:`Selection`;
+        4. of several actions the one of highest Q acts, see :class:`Selection`;
         5. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
            stored ones, and the continuous policy for uniformly random discrete actions too;
         6. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate` and
            :func:`vary_parts`;
-        7. transitions of large TD error are replayed more often, see :class:`PrioritizedReplayBuffer`;
-        8. the learning rate falls linearly to 0, and policies and targets are updated every second time.
+        7. the learning rate falls linearly to 0.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str), with a hybrid action space
@@ -63,12 +61,12 @@ class CHDP(HybridOffPolicyAlgorithm):
     :param learning_starts: how many steps of the model to collect transitions for before learning starts
     :param batch_size: Minibatch size for each gradient update
     :param tau: the soft update coefficient ("Polyak update", between 0 and 1)
-    :param gamma: the discount factor
+    :param gamma: the discount factor; 1 where only the end counts, less than the default where the next few steps do
     :param train_freq: Update the model every ``train_freq`` steps, or a tuple like ``(5, "step")`` or ``(2, "episode")``
     :param gradient_steps: How many gradient steps to do after each rollout; ``-1``: as many as steps done in the environment
     :param action_noise: noise on the scaled parameters, of size Pmax (None by default: the policies are stochastic)
-    :param replay_buffer_class: Replay buffer class to use. If ``None``: :class:`PrioritizedReplayBuffer` where it can be used,
-        else SB3's (``n_steps`` > 1 or ``optimize_memory_usage``)
+    :param replay_buffer_class: Replay buffer class to use. If ``None``, it will be automatically selected.
+        With :class:`PrioritizedReplayBuffer` transitions of large TD error are replayed more often
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer at a cost of more complexity.
     :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the critics.
@@ -108,7 +106,7 @@ class CHDP(HybridOffPolicyAlgorithm):
     # Whether the critics' loss trains the codebook
     critics_train_codebook: ClassVar[bool] = True
     # Bound on the gradient norm of every network
-    max_grad_norm: ClassVar[float | None] = None
+    max_grad_norm: ClassVar[float | None] = 1.0
 
     policy: CHDPPolicy
     actor: CooperativeActor
@@ -197,18 +195,10 @@ class CHDP(HybridOffPolicyAlgorithm):
         return HybridBox(self.action_space, self.action_layout, width, self._mask_parts())
 
     def _setup_model(self) -> None:
-        if self.replay_buffer_class is None:
-            self.replay_buffer_class = self._default_replay_buffer_class()
         super()._setup_model()
         warn_of_cost(CHDP, n_diffusion_steps=self.n_diffusion_steps, batch_size=self.batch_size)
         self._create_aliases()
         self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
-
-    def _default_replay_buffer_class(self) -> type[ReplayBuffer] | None:
-        if self.n_steps > 1 or self.optimize_memory_usage:
-            return None
-        is_dict = isinstance(self.observation_space, spaces.Dict)
-        return PrioritizedDictReplayBuffer if is_dict else PrioritizedReplayBuffer
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor

@@ -123,7 +123,6 @@ class PaperCHDP(CHDP):
     }
     uniform_fraction: ClassVar[float] = 0.0
     critics_train_codebook: ClassVar[bool] = False
-    max_grad_norm: ClassVar[float | None] = 1.0
 
     def __init__(
         self,
@@ -189,9 +188,6 @@ class PaperCHDP(CHDP):
 
     def _parameters_of_latents(self, replay_data: HybridReplaySamples) -> th.Tensor | None:
         return replay_data.parameters
-
-    def _default_replay_buffer_class(self) -> type[ReplayBuffer] | None:
-        return None
 
     def _exploration_rate(self) -> float:
         return 0.0
