@@ -11,6 +11,7 @@ from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import PaperCHDP
+from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from tests.algorithms import calls_of, fast_model, filled_model, has_learnt, sample, snapshot
 from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, make_layout_env
 
@@ -107,6 +108,18 @@ def test_two_seeded_runs_are_identical():
     first, second, other = parameters(), parameters(), parameters(seed=1)
     assert all(th.equal(first[name], second[name]) for name in first)
     assert any((first[name] != other[name]).any() for name in first)
+
+
+OPTIONS = [
+    {},
+    dict(n_action_candidates=1),
+    dict(n_diffusion_steps=1),
+    dict(policy_delay=2),
+    dict(replay_buffer_class=PrioritizedReplayBuffer),
+    dict(n_steps=3),
+    dict(latent_dim=1),
+    dict(policy_kwargs=dict(net_arch=dict(pi=[16], qf=[16]), activation_fn=th.nn.ReLU, optimizer_class=th.optim.AdamW)),
+]
 
 
 @pytest.mark.parametrize("algorithm_class, kwargs", [*((CHDP, kwargs) for kwargs in OPTIONS), (PaperCHDP, {})], ids=str)
