@@ -139,6 +139,22 @@ def test_refinement():
     assert (gain >= 0).all() and gain.mean() > 0.1
 
 
+def test_changes_of_single_choices():
+    """Of a factored action every bit turns to what is better on its own; bits that may not change stay."""
+    model = filled_model(LayoutEnv(spaces.Tuple((spaces.MultiBinary(12), box(-1, 1, 1)))))
+    actor, features = model.actor, random_features(model.actor, 50)
+    ones = actor.codebook.representative_latents(th.ones(1, 12, dtype=th.long))
+    critic = Critic(lambda _, latents, parameters: -(latents - ones).abs().gt(1e-6).sum(dim=1, keepdim=True).float())
+    masks = th.ones(50, 24, dtype=th.bool)
+    masks[:, 1] = False  # the first bit is off
+    noise = fixed_noise(actor, 50, Selection(2))
+    plain, changed = (select(actor, critic, features, noise, masks) for select in (Selection(2), Selection(2, n_changed=24)))
+    distances = (changed.discrete_actions != plain.discrete_actions).sum(dim=1)
+    assert distances.max() == 1 and not changed.discrete_actions[:, 0].any()
+    assert (changed.discrete_actions[:, 1:].sum(dim=1) >= plain.discrete_actions[:, 1:].sum(dim=1)).all()
+    assert (changed.q_values > plain.q_values).any() and th.equal(changed.parameters, plain.parameters)
+
+
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_predictions_are_the_best_candidates(deterministic):
     """The rows that predict returns are those among all that it asks the target critics about which have the highest Q."""

@@ -90,6 +90,37 @@ def test_random_values_are_uniform_over_what_masks_allow():
             assert (counts[list(values)] - 3000 / len(values)).abs().max() < 4 * 3000**0.5
 
 
+def test_alternatives_differ_in_one_choice():
+    codebook, k = ProductCodebook(RADICES, 3), random_values(RADICES, (30,))
+    for repeatable in (False, True):
+        others = codebook.alternatives(k, sum(RADICES), repeatable)
+        changed = others != k[:, None]
+        # Every value of every choice, the present one among them
+        assert changed.sum(dim=2).max() == 1 and (changed.sum(dim=1) == th.tensor(RADICES) - 1).all()
+        assert all(len({tuple(row) for row in rows}) == 1 + sum(RADICES) - len(RADICES) for rows in others.tolist())
+    some, again = (codebook.alternatives(k, 4, True) for _ in range(2))
+    assert th.equal(some, again) and (codebook.alternatives(k, 4, False) != codebook.alternatives(k, 4, False)).any()
+
+
+def test_an_action_is_allowed_if_all_of_its_values_are():
+    codebook, k = ProductCodebook(RADICES, 3), random_values(RADICES, (20, 30))
+    masks = th.rand(20, sum(RADICES)) < 0.8
+    of_choices = masks.split(RADICES, dim=1)
+    expected = th.stack([mask.gather(1, k[:, :, i]) for i, mask in enumerate(of_choices)]).all(dim=0)
+    assert expected.any() and not expected.all() and th.equal(codebook.allowed(k, masks), expected)
+
+
+def test_entries_stray_with_their_choice():
+    codebook, k = ProductCodebook(RADICES, 3), random_values(RADICES, (40,))
+    latents = codebook.representative_latents(k)
+    assert not codebook.strayed(latents, k).any()
+    other = k.clone()
+    other[:, 2] = (k[:, 2] + 1) % RADICES[2]
+    start, width = sum(block_widths(RADICES, 3)[:2]), block_widths(RADICES, 3)[2]
+    strayed = codebook.strayed(latents, other)
+    assert strayed[:, start : start + width].all() and strayed.sum() == 40 * width
+
+
 def test_usage_is_a_mean_over_the_choices():
     k = th.tensor([[0, 0], [1, 0], [0, 0], [1, 0]])
     usage, perplexity = ProductCodebook((2, 4), 3).usage(k)

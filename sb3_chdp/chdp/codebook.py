@@ -66,7 +66,7 @@ class Codebook(nn.Module):
         :return: (B, n) successive discrete actions from a random one on, from 0 on if ``repeatable``
         """
         first = 0 if repeatable else th.randint(self.n_discrete_actions, (len(k), 1), device=k.device)
-        return ((first + th.arange(n, device=k.device)) % self.n_discrete_actions).expand(len(k), n)
+        return ((first + th.arange(n, device=k.device)) % self.n_discrete_actions).expand(k.shape[0], n)
 
     def allowed(self, k: th.Tensor, masks: th.Tensor) -> th.Tensor:
         """

@@ -63,7 +63,7 @@ class ProductCodebook(ProductTable):
         """
         n_values = len(self.values)
         first = 0 if repeatable else th.randint(n_values, (len(k), 1), device=k.device)
-        changes = self.values[(first + th.arange(n, device=k.device)) % n_values].expand(len(k), n, 2)
+        changes = self.values[(first + th.arange(n, device=k.device)) % n_values].expand(k.shape[0], n, 2)
         return k[:, None].repeat(1, n, 1).scatter(2, changes[..., :1], changes[..., 1:])
 
     def allowed(self, k: th.Tensor, masks: th.Tensor) -> th.Tensor:
