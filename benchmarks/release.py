@@ -2,7 +2,7 @@
 The published models, from the runs that ``sb3-chdp benchmark paper`` has left.
 
     python benchmarks/release.py --results logs/paper     for every environment CHDP's best seed, and HyAR-TD3 on Hard Move 6
-    sb3-chdp enjoy --env Goal-v0 -f benchmarks/models      watch one
+    sb3-chdp enjoy --env Platform-v0 -f benchmarks/models  watch one
 
 A published model is a full zip of its algorithm, made small: the online networks of CHDP are replaced by their targets, by
 which deterministic actions are chosen, and optimizers start anew. It predicts as the trained model does and can be trained on.

@@ -7,7 +7,7 @@ The command ``sb3-chdp``: rl_zoo3's scripts with the algorithms and environments
     sb3-chdp train --resume logs/chdp/Platform-v0_1    go on with a killed run that was started with --save-freq
     sb3-chdp optimize --env Goal-v0 --n-trials 50      tune hyperparameters with Optuna
     sb3-chdp enjoy                               watch the agent that was trained last, of those in the folder logs
-    sb3-chdp enjoy --algo hppo --env Platform-v0 -f benchmarks/models    watch another one
+    sb3-chdp enjoy --env Platform-v0 -f benchmarks/models    watch a published one
     sb3-chdp record                              record a video of the last one
     sb3-chdp plot -y success -o curve.png        learning curves; without -o in a window
     sb3-chdp all_plots | plot_from_file | record_training   the other scripts of rl_zoo3

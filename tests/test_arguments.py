@@ -164,7 +164,7 @@ def test_load_with_another_observation_space(algorithm, tmp_path):
 
 
 def test_costly_settings():
-    with pytest.warns(UserWarning, match=r"about 42 times the work .* n_diffusion_steps=10000 \(default 15\)"):
+    with pytest.warns(UserWarning, match=r"about \d+ times the work .* n_diffusion_steps=10000 \(default 5\)"):
         make_model(CHDP, make_layout_env(), n_diffusion_steps=10_000)
 
 

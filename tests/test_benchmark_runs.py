@@ -72,7 +72,7 @@ def test_a_killed_run_goes_on_to_the_last_bit(algo, tmp_path):
     train(run)
     rows = run.rows()
     assert [row["timesteps"] for row in rows] == [80 * i for i in range(1, 31)]
-    assert rows[-1]["gradient_steps"] > 0 and rows[-1]["seconds"] > rows[0]["seconds"] > 0
+    assert rows[-1]["gradient_steps"] > 0 and rows[-1]["seconds"] > rows[0]["seconds"] >= 0
     # Rows behind the checkpoint were evaluated again, and came out the same
     assert without_seconds(rows[: len(before)]) == without_seconds(before)
     assert 0 < json.loads(run.json.read_text())["resumed_at"] < 2400

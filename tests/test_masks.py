@@ -175,10 +175,10 @@ def test_hppo_learns_faster_from_masks_than_from_a_penalty():
 def test_rl_zoo3_evaluates_with_masks(monkeypatch):
     """Its evaluations are those of SB3's callback, which hands no masks to ``predict``."""
     zoo = pytest.importorskip("sb3_chdp.zoo", exc_type=ImportError)
+    monkeypatch.setattr(callbacks, "evaluate_policy", evaluate_free_policy)  # another test may have registered
     model = make_model(PATD3, make_vec_env(MaskedEnv, 1))
     callback = callbacks.EvalCallback(make_vec_env(MaskedEnv, 1), n_eval_episodes=5, eval_freq=10, verbose=0)
     with pytest.raises(ValueError, match="masked"):
         model.learn(40, callback=callback)
-    monkeypatch.setattr(callbacks, "evaluate_policy", callbacks.evaluate_policy)  # put back after the test
     zoo.register()
     model.learn(40, callback=callback)

@@ -51,6 +51,8 @@ class ValueScale(nn.Module):
         :return: factor and summand for the critics' outputs, so that the values stay what they were
         """
         center, scale = self.center.clone(), self.scale
+        if not th.isfinite(targets).all():
+            return 1.0, 0.0  # the loss will be refused, and nothing is to have changed
         self.n_batches += 1
         weight = (1 / self.n_batches).clamp(min=MIN_UPDATE_WEIGHT)
         shift = targets.double().mean() - center

@@ -56,6 +56,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         "exploration_fraction": FRACTION,
         "exploration_initial_eps": FRACTION,
         "exploration_final_eps": FRACTION,
+        "use_masking": SWITCH,
     }
     policy: HybridPolicy
     # Standard deviation of Gaussian noise on what the policy puts out; set by algorithms with a deterministic policy
