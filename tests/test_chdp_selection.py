@@ -147,8 +147,8 @@ def test_changes_of_single_choices():
     critic = Critic(lambda _, latents, parameters: -(latents - ones).abs().gt(1e-6).sum(dim=1, keepdim=True).float())
     masks = th.ones(50, 24, dtype=th.bool)
     masks[:, 1] = False  # the first bit is off
-    noise = fixed_noise(actor, 50, Selection(2))
-    plain, changed = (select(actor, critic, features, noise, masks) for select in (Selection(2), Selection(2, n_changed=24)))
+    fixed = fixed_draws(actor, 50, Selection(2))
+    plain, changed = (select(actor, critic, features, fixed, masks) for select in (Selection(2), Selection(2, n_changed=24)))
     distances = (changed.discrete_actions != plain.discrete_actions).sum(dim=1)
     assert distances.max() == 1 and not changed.discrete_actions[:, 0].any()
     assert (changed.discrete_actions[:, 1:].sum(dim=1) >= plain.discrete_actions[:, 1:].sum(dim=1)).all()
