@@ -57,11 +57,11 @@ def test_critics_bring_codewords_of_similar_actions_together(algorithm_class):
     model = filled_model(many_actions(16), algorithm_class, gamma=0.0, codebook_lr_factor=10.0)
     buffer = model.replay_buffer
     buffer.rewards[:] = 2 * (buffer.actions[:, :, 0] % 2) - 1
-    model.train(300, 32)
+    model.train(1000, 32)
     even, odd = (model.actor.codebook.codewords.detach()[i::2] for i in (0, 1))
     distance = (odd.mean(dim=0) - even.mean(dim=0)).norm()
     spread = odd.std(dim=0).norm() + even.std(dim=0).norm()
-    assert (distance > spread) == (algorithm_class is CHDP)
+    assert (distance > 0.45 * spread) == (algorithm_class is CHDP)
 
 
 @pytest.mark.parametrize("reward", [0.0, 12345.678])

@@ -72,9 +72,10 @@ def test_replay_buffer(off_policy_algorithm, tmp_path):
 
 
 def test_continued_learning_equals_learning_at_once(algorithm):
-    constant = {}
-    if issubclass(algorithm, HybridTD3):  # by default they explore less towards the end
-        constant = dict(exploration_initial_eps=0.3, exploration_final_eps=0.3)
+    # What by default depends on the length of the training
+    constant = dict(learning_rate=1e-3)
+    if issubclass(algorithm, HybridTD3):
+        constant |= dict(exploration_initial_eps=0.3, exploration_final_eps=0.3)
     runs = []
     for parts in ((60,), (30, 30)):
         model = make_model(algorithm, make_layout_env(), **constant)

@@ -46,9 +46,9 @@ def test_the_same_actions(env_class):
         model = filled_model(env, n_transitions=80, gamma=0.9)
         model.train(1, 16)
         model.learning_starts = 0
-        model.learn(120, reset_num_timesteps=False)
-        taken.append(model.replay_buffer.actions[:50].reshape(200, -1))
-        obs = model.replay_buffer.observations[:50].reshape(200, -1)
+        model.learn(32, reset_num_timesteps=False)
+        taken.append(model.replay_buffer.actions[:28].reshape(112, -1))
+        obs = model.replay_buffer.observations[:28].reshape(112, -1)
         th.manual_seed(0)
         drawn.append(model.policy.predict_rows(obs))
         model.train(1, 200)
