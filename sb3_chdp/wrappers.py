@@ -39,8 +39,6 @@ class ScalarBoxes(gym.ActionWrapper[Any, Any, Any]):
 
     The action space stays as it is. On the way to the environment, every array of a box with one element becomes a
     Python number, also inside ``Tuple``, ``Dict`` and ``OneOf``.
-
-    :param env: environment with a hybrid action space
     """
 
     def action(self, action: Any) -> Any:
