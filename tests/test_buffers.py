@@ -110,7 +110,13 @@ def test_observations_in_a_dict_are_normalised():
 def test_chdp_sets_priorities_to_the_errors_of_its_critics(tmp_path):
     """The larger error of both critics, before their step, in their own units."""
     env = make_vec_env(HybridIdentityEnv, 2, seed=0)
-    model = filled_model(env, n_transitions=100, learning_rate=0.0, replay_buffer_kwargs=dict(alpha=1.0))
+    model = filled_model(
+        env,
+        n_transitions=100,
+        learning_rate=0.0,
+        replay_buffer_class=PrioritizedReplayBuffer,
+        replay_buffer_kwargs=dict(alpha=1.0),
+    )
     buffer, columns = model.replay_buffer, model.hybrid_space.columns
     assert isinstance(buffer, PrioritizedReplayBuffer) and buffer.alpha == 1
     buffer.priorities[:50] = 7.0
@@ -140,7 +146,7 @@ def test_chdp_sets_priorities_to_the_errors_of_its_critics(tmp_path):
 
 def test_chdp_prioritises_transitions_with_dict_observations():
     env = make_layout_env(observation_space=spaces.Dict(vector=spaces.Box(-1, 1, (2,))))
-    model = CHDP("MultiInputPolicy", env, **FAST_CHDP).learn(60)
+    model = CHDP("MultiInputPolicy", env, replay_buffer_class=PrioritizedDictReplayBuffer, **FAST_CHDP).learn(60)
     assert isinstance(model.replay_buffer, PrioritizedDictReplayBuffer)
     assert len(np.unique(model.replay_buffer.priorities[:60])) > 10, "they are updated"
 

@@ -10,9 +10,8 @@ import pytest
 import yaml
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_chdp import ALGORITHMS, CHDP
+from sb3_chdp import ALGORITHMS
 from sb3_chdp.cli import SCRIPTS
-from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.envs import ENV_IDS
 
 pytest.importorskip("rl_zoo3")
@@ -196,14 +195,6 @@ def test_users_own_hyperparameters_win(trained):
     (trained / "own.yml").write_text("default:\n  n_timesteps: 40\n  policy: MlpPolicy\n  latent_dim: 5\n")
     output = run("train", "--env", ENV_ID, "-conf", "own.yml", "--eval-freq", "-1", "-f", "own", cwd=trained)
     assert "latent_dim" in output
-
-
-def test_the_yaml_file_names_the_replay_buffer(tmp_path):
-    run("train", "--env", "Goal-v0", "-n", "100", "--eval-freq", "-1", "--save-replay-buffer", *TINY, cwd=tmp_path)
-    folder = tmp_path / "logs" / "chdp" / "Goal-v0_1"
-    model = CHDP.load(folder / "Goal-v0.zip")
-    model.load_replay_buffer(folder / "replay_buffer.pkl")
-    assert isinstance(model.replay_buffer, PrioritizedReplayBuffer)
 
 
 def test_stock_algorithm_with_a_wrapper_of_the_users(trained):
