@@ -9,7 +9,6 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from torch import nn
 
-from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.candidates import Selection
 from sb3_chdp.chdp.chdp import CHDP
 from sb3_chdp.chdp.critic import HybridCritic
@@ -45,6 +44,7 @@ class PaperPolicy(CHDPPolicy):
     """
 
     adapts_values: ClassVar[bool] = False
+    n_reads: ClassVar[int] = 0
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **{"features_extractor_class": FlattenExtractor, **kwargs})
@@ -54,15 +54,6 @@ class PaperPolicy(CHDPPolicy):
         critic_arch = get_actor_critic_arch(self.net_arch)[1]
         q_networks: list[nn.Module] = [PaperQNetwork(n_inputs, critic_arch, self.activation_fn) for _ in range(2)]
         return HybridCritic(self.observation_space, self.action_space, extractor, q_networks, self.normalize_images)
-
-    def _make_actor(self, features_dim: int) -> CooperativeActor:
-        spec, latent_dim = self.action_space.spec, self.action_space.latent_dim
-        return CooperativeActor(
-            self.action_space,
-            self._make_codebook(),
-            self._make_model(latent_dim, features_dim),
-            self._make_model(spec.max_parameters, features_dim + latent_dim),
-        )
 
     def _make_selections(self) -> tuple[Selection, Selection, Selection]:
         one = Selection(n_drawn=1)

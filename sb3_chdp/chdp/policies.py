@@ -25,8 +25,6 @@ from sb3_chdp.common.policies import CnnFeatures, HybridPolicy
 from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.common.utils import default_optimizer_kwargs
 
-# Bilinear reads of critics and continuous policy
-N_READS = 8
 # Spread of the latents around a codeword in random actions
 RANDOM_LATENT_NOISE = 0.1
 # Discrete actions that compete beside those drawn, all of them if there are no more; in a factored space changes of one choice
@@ -63,6 +61,8 @@ class CHDPPolicy(HybridPolicy):
     fixed_parameters: th.Tensor
     # Whether the units of the critics follow the rewards, see ValueScale
     adapts_values: ClassVar[bool] = True
+    # Bilinear reads of critics and continuous policy
+    n_reads: ClassVar[int] = 8
 
     def __init__(
         self,
@@ -127,7 +127,7 @@ class CHDPPolicy(HybridPolicy):
         latent_dim, n_parameters = self.action_space.latent_dim, self.action_space.spec.max_parameters
         critic_arch = get_actor_critic_arch(self.net_arch)[1]
         q_networks: list[nn.Module] = [
-            QNetwork(extractor.features_dim, latent_dim, n_parameters, critic_arch, self.activation_fn, N_READS)
+            QNetwork(extractor.features_dim, latent_dim, n_parameters, critic_arch, self.activation_fn, self.n_reads)
             for _ in range(2)
         ]
         return HybridCritic(self.observation_space, self.action_space, extractor, q_networks, self.normalize_images)
@@ -138,8 +138,8 @@ class CHDPPolicy(HybridPolicy):
             self.action_space,
             self._make_codebook(),
             self._make_model(latent_dim, features_dim),
-            self._make_model(spec.max_parameters, features_dim + latent_dim + N_READS),
-            BilinearReads(features_dim, latent_dim, N_READS),
+            self._make_model(spec.max_parameters, features_dim + latent_dim + self.n_reads),
+            BilinearReads(features_dim, latent_dim, self.n_reads) if self.n_reads else None,
         )
 
     def _make_codebook(self) -> Codebook | ProductCodebook:
