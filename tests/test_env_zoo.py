@@ -37,7 +37,7 @@ def test_an_id_with_a_slash(tmp_path):
     # A run alone has 20 frames: these are not the pictures of 60 steps, but the first steps that together have 60
     assert 60 < n_pictures(tmp_path / "videos") < 60 + 300
     assert "-to-step-60" not in next((tmp_path / "videos").glob("*.mp4")).name
-    output = run("plot", "--env", ENV_ID, "-f", "logs", "-y", "success", "-w", "1", cwd=tmp_path)
+    output = run("plot", "--env", ENV_ID, "-f", "logs", "-y", "success", "-w", "1", "-o", "p.png", cwd=tmp_path)
     assert "No data" not in output
     assert prepare_arguments("all_plots", ["-e", ENV_ID]) == ["-e", FOLDER]
 

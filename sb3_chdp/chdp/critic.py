@@ -53,7 +53,7 @@ class BilinearReads(nn.Module):
         :param latents: (B, latent_dim)
         :return: (B, n_reads)
         """
-        return th.bmm(self.maps(x).view(-1, self.n_reads, self.latent_dim), latents[:, :, None])[:, :, 0]
+        return (self.maps(x).view(-1, self.n_reads, self.latent_dim) * latents[:, None]).sum(dim=2)
 
 
 class QNetwork(nn.Module):

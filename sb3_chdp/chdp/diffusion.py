@@ -98,6 +98,7 @@ class DiffusionModel(nn.Module):
     """
 
     levels: th.Tensor
+    injected_sigmas: th.Tensor
 
     def __init__(
         self, dim: int, condition_dim: int, n_steps: int, net_arch: list[int], activation_fn: type[nn.Module] = nn.SiLU
@@ -108,6 +109,8 @@ class DiffusionModel(nn.Module):
         self.noise_predictor = NoisePredictor(dim, condition_dim, n_steps, net_arch, activation_fn)
         levels = th.tensor([self.schedule.signal, self.schedule.spread])
         self.register_buffer("levels", levels, persistent=False)
+        sigmas = th.tensor(self.schedule.sigma[:0:-1], dtype=th.float32)
+        self.register_buffer("injected_sigmas", sigmas[:, None, None], persistent=False)
 
     def sample(self, condition: th.Tensor, mask: th.Tensor | None = None, noise: th.Tensor | None = None) -> th.Tensor:
         """
@@ -125,12 +128,18 @@ class DiffusionModel(nn.Module):
         schedule = self.schedule
         by_condition, by_step = self.noise_predictor.contexts(condition)
         x = noise[0] if mask is None else noise[0] * mask
+        # What step i injects comes last but i
+        injected = noise[1:] * self.injected_sigmas
         for i in reversed(range(self.n_steps)):
             predicted = self.noise_predictor(x, by_condition + by_step[i])
-            x_start = ((x - schedule.spread[i] * predicted) / schedule.signal[i]).clamp(-1, 1)
-            x = schedule.mean_start[i] * x_start + schedule.mean_x[i] * x
-            if i > 0:
-                x = x + schedule.sigma[i] * noise[self.n_steps - i]
+            signal = schedule.signal[i]
+            # signal * x_0, clipped as x_0 is to [-1, 1]
+            scaled_start = th.sub(x, predicted, alpha=schedule.spread[i]).clamp(-signal, signal)
+            if i == 0:
+                x = scaled_start / signal
+            else:
+                mean = th.add(schedule.mean_x[i] * x, scaled_start, alpha=schedule.mean_start[i] / signal)
+                x = mean + injected[-i]
             if mask is not None:
                 x = x * mask
         return x
