@@ -21,13 +21,11 @@ class SelectedActions(NamedTuple):
     :ivar latents: (B, latent_dim)
     :ivar discrete_actions: (B,), (B, L) of a factored space
     :ivar parameters: (B, Pmax), padding 0
-    :ivar q_values: (B, 1) their min(Q1, Q2)
     """
 
     latents: th.Tensor
     discrete_actions: th.Tensor
     parameters: th.Tensor
-    q_values: th.Tensor
 
 
 class FixedDraws(NamedTuple):
@@ -73,12 +71,14 @@ class Candidates(NamedTuple):
         """
         batch_size, n = self.latents.shape[:2]
         latents, k, parameters = (part.flatten(0, 1) for part in self)
+        if n == 1:
+            return SelectedActions(latents, k, parameters)
         q_values = th.min(*critic.q_values(features.repeat_interleave(n, dim=0), latents, parameters))
         values = q_values.view(batch_size, n)
         if allowed is not None:
             values = values.masked_fill(~allowed, -th.inf)
         best = values.argmax(dim=1) + th.arange(batch_size, device=features.device) * n
-        return SelectedActions(latents[best], k[best], parameters[best], q_values[best])
+        return SelectedActions(latents[best], k[best], parameters[best])
 
 
 def drawn_candidates(
@@ -160,7 +160,7 @@ def varied_candidates(actor: CooperativeActor, actions: SelectedActions, n: int,
     :param spread: their standard deviation
     :return: candidates of B observations, the given action first, n + 1 in all
     """
-    latents, k, parameters, _ = actions
+    latents, k, parameters = actions
     noise = th.as_tensor(_variations(n, parameters.shape[1]), device=parameters.device)
     mask = actor.mask(k)
     varied = (parameters[:, None] + spread * (noise if mask is None else noise * mask[:, None])).clamp(-1, 1)

@@ -46,7 +46,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         2. critics have layer normalisation, a state value of their own and bilinear reads, see :class:`QNetwork`;
         3. the critics' loss trains the codebook too, so that actions of similar effect get similar codewords; latents from
            the buffer that no longer decode to the action taken give way to its present codeword, see ``train/latent_drift``;
-        4. of several actions the one of highest Q acts, see :class:`Selection`;
+        4. of several actions the one of highest Q acts, and is the next action in targets, see :class:`Selection`;
         5. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
            stored ones, and the continuous policy for uniformly random discrete actions too;
         6. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate` and

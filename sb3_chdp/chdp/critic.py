@@ -56,10 +56,18 @@ class BilinearReads(nn.Module):
         return (self.maps(x).view(-1, self.n_reads, self.latent_dim) * latents[:, None]).sum(dim=2)
 
 
+def value_mlp(n_inputs: int, net_arch: list[int], activation_fn: type[nn.Module]) -> nn.Sequential:
+    """:return: MLP with one output, and layer normalisation before the activation of its last hidden layer"""
+    layers = create_mlp(n_inputs, -1, net_arch, activation_fn)
+    if net_arch:
+        layers.insert(-1, nn.LayerNorm(net_arch[-1]))
+    return nn.Sequential(*layers, nn.Linear([n_inputs, *net_arch][-1], 1))
+
+
 class QNetwork(nn.Module):
     """
-    Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a, with layer normalisation, which bounds Q where there
-    is no data (Ball et al., 2023).
+    Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a. The last hidden layers are normalised, which bounds Q
+    where there is no data (Ball et al., 2023), not the ones before, which would lose how large their inputs are.
 
     A sees polynomials of the parameters, bilinear reads of all by the latent, and the products of all entries of the latent
     with all parameters: what a parameter does depends on the discrete action, often by a factor. V and A are not told apart
@@ -83,13 +91,12 @@ class QNetwork(nn.Module):
         n_reads: int,
     ):
         super().__init__()
-        normalize: list[type[nn.Module]] = [nn.LayerNorm]
         n_inputs = features_dim + n_parameters * PARAMETER_DEGREE
         self.reads = BilinearReads(n_inputs, latent_dim, n_reads)
         value_arch = [width // 2 for width in net_arch[:1]]
-        self.value = nn.Sequential(*create_mlp(features_dim, 1, value_arch, activation_fn, post_linear_modules=normalize))
+        self.value = value_mlp(features_dim, value_arch, activation_fn)
         n_inputs += latent_dim + n_reads + latent_dim * n_parameters
-        self.advantage = nn.Sequential(*create_mlp(n_inputs, 1, net_arch, activation_fn, post_linear_modules=normalize))
+        self.advantage = value_mlp(n_inputs, net_arch, activation_fn)
 
     def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
         """:return: (B, 1) values"""

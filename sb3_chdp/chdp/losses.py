@@ -26,13 +26,17 @@ def target_values(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> th.Te
     """
     Eq. 11, y = r + gamma min_j Q'_j(s', e', a') of the best next action (e', a') among a few of the target policies.
 
+    The online critics choose and the targets value, so that an error has to be in both to raise y (double Q-learning, van
+    Hasselt et al., 2016).
+
     :param policy: the networks
     :param replay_data: a batch
     :return: (B, 1) y in the units of the rewards
     """
     features = policy.critic_target.features(replay_data.next_observations)
-    next_actions = policy.select_target(policy.actor_target, policy.critic_target, features, masks=replay_data.next_masks)
-    next_values = policy.value_scale.values(next_actions.q_values)
+    latents, _, parameters = policy.select_target(policy.actor_target, policy.critic, features, masks=replay_data.next_masks)
+    next_q_values = th.min(*policy.critic_target.q_values(features, latents, parameters))
+    next_values = policy.value_scale.values(next_q_values)
     return replay_data.rewards + (1 - replay_data.dones) * replay_data.discounts * next_values
 
 

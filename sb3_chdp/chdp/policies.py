@@ -33,6 +33,9 @@ MAX_ALTERNATIVES = 64
 N_RANDOM_CANDIDATES = 64
 # Variations of the best action that compete in deterministic predictions
 N_REFINEMENT_CANDIDATES = 16
+# Actions drawn and alternatives of which the best is the next action in targets: the value of one draw alone is that of a
+# policy far worse than the one that acts
+N_NEXT_ACTIONS = 2
 
 
 class CHDPPolicy(HybridPolicy):
@@ -155,9 +158,12 @@ class CHDPPolicy(HybridPolicy):
     def _make_selections(self) -> tuple[Selection, Selection, Selection]:
         """:return: rules for acting, for deterministic predictions and for next actions"""
         spec = self.action_space.spec
-        changes = {"n_changed" if spec.is_factored else "n_uniform": min(sum(spec.radices), MAX_ALTERNATIVES)}
-        acting = Selection(self.n_action_candidates, n_random=N_RANDOM_CANDIDATES, **changes)
-        return acting, replace(acting, n_refined=N_REFINEMENT_CANDIDATES), Selection(n_drawn=1)
+        alternatives, n_values = "n_changed" if spec.is_factored else "n_uniform", sum(spec.radices)
+        acting = Selection(
+            self.n_action_candidates, n_random=N_RANDOM_CANDIDATES, **{alternatives: min(n_values, MAX_ALTERNATIVES)}
+        )
+        target = Selection(N_NEXT_ACTIONS, **{alternatives: min(n_values, N_NEXT_ACTIONS)})
+        return acting, replace(acting, n_refined=N_REFINEMENT_CANDIDATES), target
 
     def _make_optimizer(self, network: nn.Module, lr_schedule: Schedule) -> th.optim.Optimizer:
         parameters = list(network.parameters())
@@ -187,7 +193,7 @@ class CHDPPolicy(HybridPolicy):
             select, actor, fixed = self.select_deterministic, self.actor_target, self._fixed_draws(observation)
         else:
             select, actor, fixed = self.select, self.actor, None
-        latents, k, parameters, _ = select(actor, self.critic_target, features, fixed, action_masks)
+        latents, k, parameters = select(actor, self.critic_target, features, fixed, action_masks)
         return self.action_space.columns.pack(discrete_actions=k.float(), parameters=parameters, latents=latents)
 
     def _fixed_draws(self, observation: PyTorchObs) -> FixedDraws:
