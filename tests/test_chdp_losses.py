@@ -137,7 +137,7 @@ def test_parameters_with_which_latents_are_valued(parameters):
 
 @BOTH
 def test_target_values(algorithm_class):
-    """y = r + gamma (1 - d) min Q' of the next action that the online critics select; n-step discounts take the place of gamma."""
+    """y = r + gamma (1 - d) min Q' of the next action that the online critics select; n-step discounts replace gamma."""
     model = filled_model(algorithm_class=algorithm_class, gamma=0.9)
     policy, critic = model.policy, model.critic_target
     data = sample(model)._replace(dones=(th.arange(32)[:, None] % 2).float())

@@ -9,24 +9,6 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-# Chebyshev polynomials of the parameters that the critics see
-PARAMETER_DEGREE = 2
-
-
-def chebyshev_features(x: th.Tensor, degree: int) -> th.Tensor:
-    """
-    Chebyshev polynomials T_1 to T_degree of every entry. The slope of T_n is n^2 at -1 and 1, and up to about n in between:
-    they tell apart values that are close to each other, best near the bounds.
-
-    :param x: (B, n) values in [-1, 1]
-    :param degree: highest degree, at least 1
-    :return: (B, n * degree) values in [-1, 1], those of degree 1, x itself, first
-    """
-    polynomials = [th.ones_like(x), x]
-    for _ in range(degree - 1):
-        polynomials.append(2 * x * polynomials[-1] - polynomials[-2])
-    return th.cat(polynomials[1:], dim=1) if degree > 1 else x
-
 
 class BilinearReads(nn.Module):
     """
@@ -69,8 +51,8 @@ class QNetwork(nn.Module):
     Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a. The last hidden layers are normalised, which bounds Q
     where there is no data (Ball et al., 2023), not the ones before, which would lose how large their inputs are.
 
-    A sees polynomials of the parameters, bilinear reads of all by the latent, and the products of all entries of the latent
-    with all parameters: what a parameter does depends on the discrete action, often by a factor. V and A are not told apart
+    A sees bilinear reads of features and parameters by the latent, and the products of all entries of the latent with all
+    parameters: what a parameter does depends on the discrete action, often by a factor. V and A are not told apart
     further: V learns what does not depend on the action (as in Wang et al., 2016).
 
     :param features_dim: number of features of the state
@@ -91,7 +73,7 @@ class QNetwork(nn.Module):
         n_reads: int,
     ):
         super().__init__()
-        n_inputs = features_dim + n_parameters * PARAMETER_DEGREE
+        n_inputs = features_dim + n_parameters
         self.reads = BilinearReads(n_inputs, latent_dim, n_reads)
         value_arch = [width // 2 for width in net_arch[:1]]
         self.value = value_mlp(features_dim, value_arch, activation_fn)
@@ -100,7 +82,7 @@ class QNetwork(nn.Module):
 
     def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
         """:return: (B, 1) values"""
-        x = th.cat([features, chebyshev_features(parameters, PARAMETER_DEGREE)], dim=1)
+        x = th.cat([features, parameters], dim=1)
         products = (latents[:, :, None] * parameters[:, None]).flatten(1)
         return self.value(features) + self.advantage(th.cat([x, latents, self.reads(x, latents), products], dim=1))
 
