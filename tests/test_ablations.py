@@ -95,7 +95,7 @@ def test_sequential_update(table, name):
     model = make(table, name, learning_rate=0.0, **({} if table == "chdp_paper_" else {"policy_delay": 1}))
     calls = calls_of(model.critic.q_networks[0])
     model.train(1, 400)
-    (_, stored, _), _, (_, improved, _) = calls
+    *_, (_, stored, _), _, (_, improved, _) = calls
     representative = model.actor.codebook.representative_latents(th.arange(3))
     is_uniform = (improved[:, None] == representative).all(dim=2).any(dim=1).float().mean()
     assert is_uniform == pytest.approx(model.uniform_fraction, abs=0.02) or name in ("without_codebook", "without_both")
