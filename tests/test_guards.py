@@ -1,11 +1,14 @@
 """Numbers that nothing can be learnt from are refused before they are stored or fed, and losses before they move a network."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_chdp import HPPO, PATD3
 from sb3_chdp.common.checks import check_numbers
 from sb3_chdp.common.resume import ResumableCheckpoint, resume
 from sb3_chdp.common.utils import NonFiniteLossError, gradient_step
@@ -135,6 +138,65 @@ def test_observations_that_normalization_hides(off_policy_algorithm):
         make_model(off_policy_algorithm, env).learn(60)
 
 
+@pytest.mark.parametrize("observation_space", [None, DICT], ids=["box", "dict"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e30], ids=str)
+@pytest.mark.parametrize("place", ["first", "next", "reward"])  # it counts no terminal observations
+def test_normalization_forgets_what_is_refused(place, value, observation_space):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # NumPy's, of infinite means
+        env = VecNormalize(DummyVecEnv([lambda: BrokenEnv(place, value, observation_space)]))
+        model = make_model(PATD3, env, "MlpPolicy" if observation_space is None else "MultiInputPolicy")
+        with pytest.raises(ValueError, match="must be finite"):
+            model.learn(60)
+        statistics = [env.ret_rms, *(env.obs_rms.values() if isinstance(env.obs_rms, dict) else [env.obs_rms])]
+        assert all(np.abs(number).max() < 100 for rms in statistics for number in (rms.mean, rms.var))
+        # The same environment, which is sound from now on
+        model.learn(40, reset_num_timesteps=False)
+    assert is_finite(model)
+
+
+def test_normalization_forgets_a_refused_first_observation(algorithm):
+    broken = BrokenEnv("first", np.nan)
+    broken.n_resets = 1
+    env = VecNormalize(DummyVecEnv([lambda: broken]))
+    model = make_model(algorithm, env)
+    with pytest.raises(ValueError, match="The observation must be finite"):
+        model.learn(60)
+    assert np.isfinite(env.obs_rms.mean).all()
+    model.learn(40, reset_num_timesteps=False)
+    assert is_finite(model)
+
+
+class LargeObservations(LayoutEnv):
+    """Observations of up to 1e14, and 9e14 at the end of an episode."""
+
+    def large(self, unit=1e14):
+        return (unit * self.np_random.uniform(-1, 1, 2)).astype(np.float32)
+
+    def reset(self, **kwargs):
+        _, info = super().reset(**kwargs)
+        return self.large(), info
+
+    def step(self, action):
+        _, reward, terminated, truncated, info = super().step(action)
+        return self.large(9e14 if terminated or truncated else 1e14), reward, terminated, truncated, info
+
+
+@pytest.mark.parametrize("activation_fn", [th.nn.Tanh, th.nn.ReLU])
+def test_large_observations_are_learnt_from_or_refused(algorithm, activation_fn):
+    env = LargeObservations(layouts()["shared"], box(-np.inf, np.inf, 2))
+    model = make_model(algorithm, env, policy_kwargs=dict(net_arch=[8, 8], activation_fn=activation_fn))
+    before = snapshot(model)
+    try:
+        model.learn(60)
+    except NonFiniteLossError as error:
+        assert "smaller rewards or observations" in str(error)
+        assert algorithm is not HPPO or activation_fn is th.nn.ReLU
+    else:
+        assert has_learnt(model, before)
+    assert is_finite(model)
+
+
 class ShortLastObservation(LayoutEnv):
     """Of shape (1,) instead of (2,), which NumPy would stretch."""
 
@@ -174,6 +236,27 @@ def test_a_loss_is_refused_before_it_moves_anything(factor, message):
     assert (parameter == 1).all() and not optimizer.state
     gradient_step(parameter.mean(), [optimizer], 1.0, "my_loss")
     assert (parameter != 1).all()
+
+
+@pytest.mark.parametrize("gradient", [np.nan, np.inf, 1e25], ids=str)
+@pytest.mark.parametrize("max_grad_norm", [None, 1.0])
+def test_a_gradient_is_refused_before_it_moves_anything(gradient, max_grad_norm):
+    """Of one parameter alone, which has a single entry, for a finite loss."""
+    parameters = [th.nn.Parameter(th.ones(3)), th.nn.Parameter(th.ones(1))]
+    optimizers = [th.optim.Adam([parameter]) for parameter in parameters]
+    parameters[1].register_hook(lambda _: th.tensor([gradient]))
+    with pytest.raises(NonFiniteLossError, match="got 6"):
+        gradient_step(parameters[0].sum() + 3 * parameters[1].sum(), optimizers, max_grad_norm)
+    assert all((parameter == 1).all() for parameter in parameters) and not any(each.state for each in optimizers)
+
+
+def test_gradients_are_clipped_per_optimizer():
+    parameters = [th.nn.Parameter(th.ones(2)) for _ in range(3)]
+    optimizers = [th.optim.SGD([parameter], lr=1.0) for parameter in parameters]
+    # The last one has no gradient
+    gradient_step(3 * parameters[0][0] + 4 * parameters[0][1] + 0.5 * parameters[1].sum(), optimizers, max_grad_norm=1.0)
+    for parameter, change in zip(parameters, [(0.6, 0.8), (0.5, 0.5), (0, 0)], strict=True):
+        np.testing.assert_allclose(1 - parameter.detach(), change, rtol=1e-5)
 
 
 @pytest.mark.parametrize("with_checkpoint", [True, False])

@@ -32,7 +32,7 @@ from sb3_chdp.common.arguments import (
 from sb3_chdp.common.checks import check_observation_space, check_policy_kwargs
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.masks import env_masks
-from sb3_chdp.common.native_env import NativeActionVecEnv
+from sb3_chdp.common.native_env import NativeActionVecEnv, uncounted_if_refused
 from sb3_chdp.common.resume import last_checkpoint
 from sb3_chdp.common.safe_zip import VERSION, misfit, read_model, save_model
 from sb3_chdp.common.spaces import LAYOUTS, MAX_DISCRETE_ACTIONS
@@ -194,13 +194,14 @@ class HybridAlgorithm(BaseAlgorithm):
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if self.use_masking and self.env is not None and not is_masking_supported(self.env):
             raise ValueError("use_masking is True but the environment has no method action_masks()")
-        total_timesteps, callback = super()._setup_learn(*args, **kwargs)
-        assert self.env is not None, "You must set the environment before calling learn()"
-        try:
-            self.native_env(self.env).check_observations(self._last_obs)
-        except ValueError:
-            self._last_obs = None  # learning begins with a reset again
-            raise
+        with uncounted_if_refused(self._vec_normalize_env):
+            total_timesteps, callback = super()._setup_learn(*args, **kwargs)
+            assert self.env is not None, "You must set the environment before calling learn()"
+            try:
+                self.native_env(self.env).check_observations(self._last_obs)
+            except ValueError:
+                self._last_obs = None  # learning begins with a reset again
+                raise
         return total_timesteps, callback
 
     def _excluded_save_params(self) -> list[str]:

@@ -1,14 +1,36 @@
 """The environment as rollouts see it: rows go in, native actions reach the user's environment."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_chdp.common.checks import check_numbers
 from sb3_chdp.common.hybrid_box import HybridBox
+
+
+@contextmanager
+def uncounted_if_refused(normalize: VecNormalize | None) -> Iterator[None]:
+    """
+    ``VecNormalize`` counts numbers before they can be checked: it forgets those that are refused within the block.
+
+    :param normalize: the wrapper, None if there is none
+    """
+    obs_rms = getattr(normalize, "obs_rms", {})
+    parts = [] if normalize is None else [normalize, normalize.ret_rms]
+    parts += obs_rms.values() if isinstance(obs_rms, dict) else [obs_rms]
+    # Without copies of arrays: updates put new ones in their place
+    before = [dict(vars(part)) for part in parts]
+    try:
+        yield
+    except ValueError:
+        for part, state in zip(parts, before, strict=True):
+            vars(part).update(state)
+        raise
 
 
 class NativeActionVecEnv(VecEnvWrapper):
@@ -34,14 +56,15 @@ class NativeActionVecEnv(VecEnvWrapper):
         self.venv.step_async(native_actions)
 
     def step_wait(self) -> VecEnvStepReturn:
-        obs, rewards, dones, infos = self.venv.step_wait()
-        # One NaN would ruin the networks for good
-        self.check_observations(obs)
-        check_numbers("The reward", rewards)
-        if self._normalize is not None:
-            check_numbers("The reward before normalization", self._normalize.old_reward)
-        for i in np.flatnonzero(dones).tolist():
-            self._check_terminal(i, infos[i].get("terminal_observation"))
+        with uncounted_if_refused(self._normalize):
+            obs, rewards, dones, infos = self.venv.step_wait()
+            # One NaN would ruin the networks for good
+            self.check_observations(obs)
+            check_numbers("The reward", rewards)
+            if self._normalize is not None:
+                check_numbers("The reward before normalization", self._normalize.old_reward)
+            for i in np.flatnonzero(dones).tolist():
+                self._check_terminal(i, infos[i].get("terminal_observation"))
         return obs, rewards, dones, infos
 
     def check_observations(self, obs: VecEnvObs) -> None:

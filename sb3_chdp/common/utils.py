@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import islice
 from typing import Any
 
 import torch as th
@@ -10,6 +11,8 @@ from torch import nn
 
 # Rows of a table that are searched at a time, and size of the groups that are told apart first; one divides the other
 NEAREST_ROW_CHUNK, NEAREST_ROW_GROUP = 2048, 128
+# Adam keeps squares of gradients in float32
+LARGEST_NORM = math.sqrt(th.finfo(th.float32).max)
 
 
 class TargetUpdate:
@@ -72,20 +75,25 @@ def gradient_step(
     :param optimizers: their parameters are all that moves
     :param max_grad_norm: bound on the gradient norm of each optimizer's parameters, None for none
     :param name: name of the loss in the log, for the message
-    :raises NonFiniteLossError: before anything moves, if the loss or a gradient norm is not finite
+    :raises NonFiniteLossError: before anything moves, if the loss is not finite, or the square of the gradient's norm
     """
     groups = [[p for group in optimizer.param_groups for p in group["params"]] for optimizer in optimizers]
     params = [p for group in groups for p in group]
     # Without a gradient: those of a shared features extractor, which belongs to another optimizer's loss
-    for p, gradient in zip(params, th.autograd.grad(loss, params, allow_unused=True), strict=True):
+    gradients = th.autograd.grad(loss, params, allow_unused=True)
+    for p, gradient in zip(params, gradients, strict=True):
         p.grad = gradient
-    norms = [th.nn.utils.get_total_norm([p.grad for p in group if p.grad is not None]) for group in groups]
-    # One look for all of it. Infinite norms are also those of gradients whose squares, which Adam keeps, are infinite
-    if not math.isfinite(sum(norms, loss.detach()).item()):
-        raise NonFiniteLossError(name, loss.item())
-    for optimizer, group, norm in zip(optimizers, groups, norms, strict=True):
+    # One look for all of it: on a GPU, each look waits for the whole computation
+    value, *norms = th.stack([loss.detach(), *th._foreach_norm([g for g in gradients if g is not None])]).tolist()
+    if not (math.isfinite(value) and math.hypot(*norms) <= LARGEST_NORM):
+        raise NonFiniteLossError(name, value)
+    remaining = iter(norms)
+    for optimizer, group in zip(optimizers, groups, strict=True):
         if max_grad_norm is not None:
-            th.nn.utils.clip_grads_with_norm_(group, max_grad_norm, norm)
+            own = [p.grad for p in group if p.grad is not None]
+            norm = math.hypot(*islice(remaining, len(own)))
+            if norm > max_grad_norm:
+                th._foreach_mul_(own, max_grad_norm / norm)
         optimizer.step()
 
 

@@ -1,5 +1,6 @@
 """Hybrid proximal policy optimization."""
 
+import math
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -239,17 +240,22 @@ class HPPO(HybridAlgorithm, PPO):
         if not np.isfinite(np.vdot(returns, returns)):
             raise NonFiniteLossError("value_loss")
 
-        def check_gradient(optimizer: th.optim.Optimizer, *_: Any) -> None:
-            gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
-            if not th.nn.utils.get_total_norm(gradients).isfinite():
+        max_grad_norm = self.max_grad_norm
+
+        def clip_gradient(optimizer: th.optim.Optimizer, *_: Any) -> None:
+            params = [p for group in optimizer.param_groups for p in group["params"]]
+            if not th.nn.utils.clip_grad_norm_(params, max_grad_norm).isfinite():
                 raise NonFiniteLossError("loss")
 
         # For the time of the call: copies of a model have no hooks
-        hook = self.policy.optimizer.register_step_pre_hook(check_gradient)
+        hook = self.policy.optimizer.register_step_pre_hook(clip_gradient)
+        # SB3 would clip a gradient of infinite norm to zeros, and learn nothing from then on
+        self.max_grad_norm = math.inf
         try:
             super().train()
         finally:
             hook.remove()
+            self.max_grad_norm = max_grad_norm
 
     def dump_logs(self, iteration: int = 0) -> None:
         if iteration > 0:
