@@ -39,7 +39,7 @@ def test_an_id_with_a_slash(tmp_path):
     assert "-to-step-60" not in next((tmp_path / "videos").glob("*.mp4")).name
     output = run("plot", "--env", ENV_ID, "-f", "logs", "-y", "success", "-w", "1", "-o", "p.png", cwd=tmp_path)
     assert "No data" not in output
-    assert prepare_arguments("all_plots", ["-e", ENV_ID]) == ["-e", FOLDER]
+    assert prepare_arguments("all_plots", ["-e", ENV_ID, "-f", "logs"]) == ["-a", "chdp", "-e", FOLDER, "-f", "logs"]
 
 
 @pytest.mark.parametrize("env_id", [ENV_ID, "CartPole-v1"])
