@@ -71,7 +71,7 @@ class Candidates(NamedTuple):
         """
         batch_size, n = self.latents.shape[:2]
         latents, k, parameters = (part.flatten(0, 1) for part in self)
-        if n == 1:
+        if n == 1:  # nothing to choose
             return SelectedActions(latents, k, parameters)
         q_values = th.min(*critic.q_values(features.repeat_interleave(n, dim=0), latents, parameters))
         values = q_values.view(batch_size, n)

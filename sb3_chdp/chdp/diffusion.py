@@ -128,7 +128,7 @@ class DiffusionModel(nn.Module):
         schedule = self.schedule
         by_condition, by_step = self.noise_predictor.contexts(condition)
         x = noise[0] if mask is None else noise[0] * mask
-        # What step i injects comes last but i
+        # In the order of the steps, N to 2
         injected = noise[1:] * self.injected_sigmas
         for i in reversed(range(self.n_steps)):
             predicted = self.noise_predictor(x, by_condition + by_step[i])

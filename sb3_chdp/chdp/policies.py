@@ -33,8 +33,7 @@ MAX_ALTERNATIVES = 64
 N_RANDOM_CANDIDATES = 64
 # Variations of the best action that compete in deterministic predictions
 N_REFINEMENT_CANDIDATES = 16
-# Actions drawn and alternatives of which the best is the next action in targets: the value of one draw alone is that of a
-# policy far worse than the one that acts
+# Actions drawn, and as many alternatives, of which the best is the next action in targets: the best of several acts, too
 N_NEXT_ACTIONS = 2
 
 
