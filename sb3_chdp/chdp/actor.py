@@ -4,7 +4,7 @@ import torch as th
 from torch import nn
 
 from sb3_chdp.chdp.codebook import Codebook
-from sb3_chdp.chdp.critic import BilinearReads
+from sb3_chdp.chdp.critic import AttentionReads
 from sb3_chdp.chdp.diffusion import DiffusionModel
 from sb3_chdp.chdp.product_codebook import ProductCodebook
 from sb3_chdp.common.hybrid_box import HybridBox
@@ -33,7 +33,7 @@ class CooperativeActor(nn.Module):
         codebook: Codebook | ProductCodebook,
         discrete_policy: DiffusionModel,
         continuous_policy: DiffusionModel,
-        reads: BilinearReads | None = None,
+        reads: AttentionReads | None = None,
     ):
         super().__init__()
         self.codebook = codebook

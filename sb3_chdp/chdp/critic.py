@@ -10,12 +10,16 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 
-class BilinearReads(nn.Module):
+# Of the logits: such attention starts even and learns as fast as the rest
+SHARPNESS = 3.0
+
+
+class AttentionReads(nn.Module):
     """
-    What a latent e reads of a vector x: e^T W_j x for j = 1 to ``n_reads``.
+    What a latent e reads of the features x: ``n_reads`` means of their entries, weighted by softmax(W_j e + b_j).
 
     A discrete action often concerns a part of the state, its channel or its product. An MLP on [x, e] has to learn for each
-    action which part that is; a read finds it by a product, for all actions with the same W_j.
+    action which part that is, and hardly carries it over to new states; attention picks entries out.
 
     :param n_inputs: width of x
     :param latent_dim: width of the latent
@@ -24,10 +28,8 @@ class BilinearReads(nn.Module):
 
     def __init__(self, n_inputs: int, latent_dim: int, n_reads: int):
         super().__init__()
-        self.n_reads, self.latent_dim = n_reads, latent_dim
-        self.maps = nn.Linear(n_inputs, n_reads * latent_dim, bias=False)
-        # Unit variance for x of unit variance and latents uniform in [-1, 1]
-        nn.init.normal_(self.maps.weight, std=(3 / (n_inputs * latent_dim)) ** 0.5)
+        self.n_inputs, self.n_reads = n_inputs, n_reads
+        self.logits = nn.Linear(latent_dim, n_reads * n_inputs)
 
     def forward(self, x: th.Tensor, latents: th.Tensor) -> th.Tensor:
         """
@@ -35,7 +37,8 @@ class BilinearReads(nn.Module):
         :param latents: (B, latent_dim)
         :return: (B, n_reads)
         """
-        return (self.maps(x).view(-1, self.n_reads, self.latent_dim) * latents[:, None]).sum(dim=2)
+        weights = (SHARPNESS * self.logits(latents).unflatten(1, (self.n_reads, self.n_inputs))).softmax(dim=2)
+        return th.bmm(weights, x[:, :, None]).squeeze(2)
 
 
 def value_mlp(n_inputs: int, net_arch: list[int], activation_fn: type[nn.Module]) -> nn.Sequential:
@@ -51,8 +54,8 @@ class QNetwork(nn.Module):
     Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a. The last hidden layers are normalised, which bounds Q
     where there is no data (Ball et al., 2023), not the ones before, which would lose how large their inputs are.
 
-    A sees bilinear reads of features and parameters by the latent, and the products of all entries of the latent with all
-    parameters: what a parameter does depends on the discrete action, often by a factor. V and A are not told apart
+    A sees what the latent reads of the features, see :class:`AttentionReads`, and the products of all entries of the latent with
+    all parameters: what a parameter does depends on the discrete action, often by a factor. V and A are not told apart
     further: V learns what does not depend on the action (as in Wang et al., 2016).
 
     :param features_dim: number of features of the state
@@ -60,7 +63,7 @@ class QNetwork(nn.Module):
     :param n_parameters: number of parameters
     :param net_arch: hidden layers of A; V has one of half the width of the first
     :param activation_fn: activation function
-    :param n_reads: number of bilinear reads
+    :param n_reads: number of reads
     """
 
     def __init__(
@@ -73,18 +76,17 @@ class QNetwork(nn.Module):
         n_reads: int,
     ):
         super().__init__()
-        n_inputs = features_dim + n_parameters
-        self.reads = BilinearReads(n_inputs, latent_dim, n_reads)
+        self.reads = AttentionReads(features_dim, latent_dim, n_reads)
         value_arch = [width // 2 for width in net_arch[:1]]
         self.value = value_mlp(features_dim, value_arch, activation_fn)
-        n_inputs += latent_dim + n_reads + latent_dim * n_parameters
+        n_inputs = features_dim + n_parameters + latent_dim + n_reads + latent_dim * n_parameters
         self.advantage = value_mlp(n_inputs, net_arch, activation_fn)
 
     def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
         """:return: (B, 1) values"""
-        x = th.cat([features, parameters], dim=1)
         products = (latents[:, :, None] * parameters[:, None]).flatten(1)
-        return self.value(features) + self.advantage(th.cat([x, latents, self.reads(x, latents), products], dim=1))
+        x = th.cat([features, parameters, latents, self.reads(features, latents), products], dim=1)
+        return self.value(features) + self.advantage(x)
 
     @th.no_grad()
     def rescale(self, factor: float, summand: float) -> None:

@@ -14,7 +14,7 @@ from torch import nn
 from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.candidates import FixedDraws, Selection
 from sb3_chdp.chdp.codebook import Codebook
-from sb3_chdp.chdp.critic import BilinearReads, HybridCritic, QNetwork
+from sb3_chdp.chdp.critic import AttentionReads, HybridCritic, QNetwork
 from sb3_chdp.chdp.diffusion import DiffusionModel
 from sb3_chdp.chdp.product_codebook import ProductCodebook
 from sb3_chdp.chdp.repeatable_noise import repeatable_noise
@@ -63,7 +63,7 @@ class CHDPPolicy(HybridPolicy):
     fixed_parameters: th.Tensor
     # Whether the units of the critics follow the rewards, see ValueScale
     adapts_values: ClassVar[bool] = True
-    # Bilinear reads of critics and continuous policy
+    # What critics and continuous policy read of the features, see AttentionReads
     n_reads: ClassVar[int] = 8
 
     def __init__(
@@ -141,7 +141,7 @@ class CHDPPolicy(HybridPolicy):
             self._make_codebook(),
             self._make_model(latent_dim, features_dim),
             self._make_model(spec.max_parameters, features_dim + latent_dim + self.n_reads),
-            BilinearReads(features_dim, latent_dim, self.n_reads) if self.n_reads else None,
+            AttentionReads(features_dim, latent_dim, self.n_reads) if self.n_reads else None,
         )
 
     def _make_codebook(self) -> Codebook | ProductCodebook:
