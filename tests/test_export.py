@@ -17,8 +17,7 @@ from tests.hybrid_envs import LayoutEnv, box, layouts, make_layout_env
 ort = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
-ALGORITHMS = ["PaperCHDP", "HPPO", "PATD3", "PDQNTD3", "HHQNTD3", "HyARTD3"]
-WAITING = pytest.mark.xfail(strict=True, raises=NotImplementedError, reason="rounding chooses among refined actions")
+ALGORITHMS = ["CHDP", "PaperCHDP", "HPPO", "PATD3", "PDQNTD3", "HHQNTD3", "HyARTD3"]
 N = 1_000
 PAGE = Path(__file__).parent.parent / "docs" / "guide" / "export.md"
 FACTORED = spaces.Tuple((spaces.MultiDiscrete([40, 3, 30]), box(-1, 1, 2)))
@@ -74,7 +73,7 @@ def check(model, tmp_path, n=N):
         np.testing.assert_allclose((np.asarray(parameters) - spec.centre[options]) / half, own_parameters, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", [*ALGORITHMS, pytest.param("CHDP", marks=WAITING)])
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_algorithm(name, tmp_path):
     check(getattr(sb3_chdp, name)("MlpPolicy", make_layout_env("flat"), seed=1), tmp_path)
 
@@ -96,7 +95,7 @@ def test_many_discrete_actions(tmp_path):
     check(sb3_chdp.HyARTD3("MlpPolicy", LayoutEnv(MANY), seed=0, buffer_size=10), tmp_path, n=50)
 
 
-@pytest.mark.parametrize("name", ["HPPO", "PATD3", "HHQNTD3", "HyARTD3"])
+@pytest.mark.parametrize("name", ["CHDP", "HPPO", "PATD3", "HHQNTD3", "HyARTD3"])
 def test_factored_actions(name, tmp_path):
     check(getattr(sb3_chdp, name)("MlpPolicy", LayoutEnv(FACTORED), seed=0), tmp_path, n=50)
 
