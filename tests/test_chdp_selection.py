@@ -5,7 +5,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 
-from sb3_chdp.chdp.candidates import FixedDraws, Selection
+from sb3_chdp.chdp.candidates import FixedDraws, SelectedActions, Selection, refined
 from tests.algorithms import calls_of, filled_model
 from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, make_layout_env
 
@@ -15,7 +15,6 @@ KINDS = {
     "uniform": Selection(n_drawn=2, n_uniform=N_ACTIONS),
     "random": Selection(n_drawn=1, n_random=8),
     "all": Selection(n_drawn=2, n_uniform=2, n_random=5),
-    "refined": Selection(n_drawn=2, n_refined=6),
 }
 SELECTIONS = pytest.mark.parametrize("select", KINDS.values(), ids=KINDS)
 
@@ -70,14 +69,12 @@ def test_the_best_of_all_candidates_is_taken(actor, select):
     latents, k, parameters = select(actor, critic, features)
     assert latents.shape == (5, 4) and k.shape == (5,) and parameters.shape == (5, 1)
     assert (actor.codebook.quantize(latents) == k).all()
-    # Later rounds refine what was best in the first, which competes again
-    first, last = critic.asked[0], critic.asked[-1]
+    (asked,) = critic.asked
     n = select.n_drawn + select.n_uniform + select.n_random
-    assert len(first[0]) == 5 * n and (first[0].view(5, n, -1) == features[:, None]).all()
-    best = last[3].view(5, -1).max(dim=1, keepdim=True)
-    for chosen, asked in ((latents, last[1]), (parameters, last[2])):
-        assert th.equal(chosen, asked.view(5, -1, asked.shape[1])[th.arange(5), best.indices[:, 0]])
-    assert (best.values >= first[3].view(5, n).max(dim=1, keepdim=True).values).all()
+    assert len(asked[0]) == 5 * n and (asked[0].view(5, n, -1) == features[:, None]).all()
+    best = asked[3].view(5, n).argmax(dim=1)
+    for chosen, of_all in ((latents, asked[1]), (parameters, asked[2])):
+        assert th.equal(chosen, of_all.view(5, n, -1)[th.arange(5), best])
 
 
 @SELECTIONS
@@ -122,8 +119,17 @@ def test_random_candidates_find_what_the_policies_miss():
     assert errors[1] < 0.1 < errors[0]
 
 
+def refine(actor, critic, start, n=32, spread=0.1):
+    """:return: what refined actions have for parameters, all of action 1"""
+    k = th.ones(len(start), dtype=th.long)
+    actions = SelectedActions(actor.codebook.representative_latents(k), k, start)
+    latents, same_k, parameters = refined(actor, critic, random_features(actor, len(start)), actions, n, spread)
+    assert th.equal(latents, actions.latents) and th.equal(same_k, k)
+    return parameters
+
+
 def test_refinement():
-    """Variations of the best action come nearer to the best parameters; the discrete action and padding stay."""
+    """Parameters come nearer to what is worth more; the discrete action and padding stay."""
     parameters = spaces.Tuple((box(-1, 1, 1), box(-1, 1, 2)))
     model = filled_model(LayoutEnv(spaces.Tuple((spaces.Discrete(2), parameters))))
     actor, mask = model.actor, th.as_tensor(np.array(model.hybrid_space.spec.mask)).bool()
@@ -131,11 +137,33 @@ def test_refinement():
     features = random_features(actor, 50)
     noise, critic = fixed_draws(actor, 50, Selection(1)), Critic(near(0.7))
     plain = Selection(1)(actor, critic, features, noise)
-    refined = Selection(1, n_refined=32)(actor, critic, features, noise)
-    assert th.equal(plain.discrete_actions, refined.discrete_actions) and th.equal(plain.latents, refined.latents)
-    assert not refined.parameters[~mask[refined.discrete_actions]].any() and refined.parameters.abs().max() <= 1
-    gain = (plain.parameters[:, 0] - 0.7).abs() - (refined.parameters[:, 0] - 0.7).abs()
-    assert (gain >= 0).all() and gain.mean() > 0.1
+    moved = Selection(1, n_refined=32)(actor, critic, features, noise)
+    assert th.equal(plain.discrete_actions, moved.discrete_actions) and th.equal(plain.latents, moved.latents)
+    assert not moved.parameters[~mask[moved.discrete_actions]].any() and moved.parameters.abs().max() <= 1
+    before, after = ((chosen.parameters[:, 0] - 0.7).abs() for chosen in (plain, moved))
+    far = before > 0.2
+    assert far.any() and (after < before - 0.05)[far].all() and (after < 0.2)[~far].all()
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
+def test_refinement_is_continuous_in_the_values(actor, factor):
+    """What rounding does to the values hardly moves the parameters, be the values flat or steep."""
+    start = th.linspace(-1, 1, 200)[:, None]
+
+    def value(rounding):
+        return lambda _, __, parameters: factor * (3 * parameters).sin() * (1 + rounding * (1e5 * parameters).sin())
+
+    exact, rounded = (refine(actor, Critic(value(rounding)), start) for rounding in (0.0, 1e-6))
+    assert (exact - rounded).abs().max() < 1e-5
+    assert (exact - start).abs().max() > 0.01 * min(factor, 1)
+
+
+def test_refinement_leaves_what_is_best(actor):
+    """At a peak, where nothing is worth more or less, and at the bounds, outside which there is nothing."""
+    peak = lambda _, __, parameters: -(parameters[:, :1] - 0.3).square()  # noqa: E731
+    for value, best in ((peak, 0.3), (lambda _, __, p: 0 * p[:, :1], 0.6), (near(2.0), 1.0), (near(-2.0), -1.0)):
+        start = th.full((1, 1), best)
+        assert refine(actor, Critic(value), start).item() == pytest.approx(best, abs=1e-5)
 
 
 def test_changes_of_single_choices():
@@ -164,11 +192,11 @@ def test_predictions_are_the_best_candidates(deterministic):
     for network, values in zip(q_networks, outputs, strict=True):
         network.register_forward_hook(lambda module, args, q, values=values: values.append(q.detach()))
     rows = model.policy.predict_rows(obs, deterministic)
-    # In the last round the best of all before competes again
-    best = th.min(outputs[0][-1], outputs[1][-1]).view(6, -1).argmax(dim=1)
-    for name, asked in zip(("latents", "parameters"), calls[-1][1:], strict=True):
+    best = th.min(outputs[0][0], outputs[1][0]).view(6, -1).argmax(dim=1)
+    # Deterministic ones are refined: what the parameters are near to
+    for name, asked, tolerance in zip(("latents", "parameters"), calls[0][1:], (0, 0.5 if deterministic else 0), strict=True):
         expected = asked.view(6, -1, asked.shape[1])[th.arange(6), best]
-        np.testing.assert_array_equal(columns.view(rows, name), expected)
+        np.testing.assert_allclose(columns.view(rows, name), expected, atol=tolerance)
     latents = th.as_tensor(columns.view(rows, "latents"))
     assert (model.actor.codebook.quantize(latents).numpy() == columns.discrete_actions(rows)).all()
     assert len(calls[0][0]) >= 6 * (model.n_action_candidates + N_ACTIONS)

@@ -12,6 +12,8 @@ from sb3_chdp.chdp.critic import HybridCritic
 
 # Standard deviations of the changes of the parameters in successive refinements
 REFINEMENT_SPREADS = (0.1, 0.03)
+# Spread of the values, in the critics' units, below which parameters hardly move: rounding must not
+FLAT_VALUES = 0.01
 
 
 class SelectedActions(NamedTuple):
@@ -62,6 +64,16 @@ class Candidates(NamedTuple):
         batch_size = self.latents.shape[0]
         return Candidates(*(th.cat([a, b.expand(batch_size, *b.shape[1:])], dim=1) for a, b in zip(self, others, strict=True)))
 
+    def values(self, critic: HybridCritic, features: th.Tensor) -> th.Tensor:
+        """
+        :param critic: twin critic
+        :param features: (B, features_dim) features of the observations
+        :return: (B, n) min(Q1, Q2)
+        """
+        batch_size, n = self.latents.shape[:2]
+        latents, parameters = self.latents.flatten(0, 1), self.parameters.flatten(0, 1)
+        return th.min(*critic.q_values(features.repeat_interleave(n, dim=0), latents, parameters)).view(batch_size, n)
+
     def best(self, critic: HybridCritic, features: th.Tensor, allowed: th.Tensor | None = None) -> SelectedActions:
         """
         :param critic: twin critic
@@ -73,8 +85,7 @@ class Candidates(NamedTuple):
         latents, k, parameters = (part.flatten(0, 1) for part in self)
         if n == 1:  # nothing to choose
             return SelectedActions(latents, k, parameters)
-        q_values = th.min(*critic.q_values(features.repeat_interleave(n, dim=0), latents, parameters))
-        values = q_values.view(batch_size, n)
+        values = self.values(critic, features)
         if allowed is not None:
             values = values.masked_fill(~allowed, -th.inf)
         best = values.argmax(dim=1) + th.arange(batch_size, device=features.device) * n
@@ -146,43 +157,52 @@ def changed_candidates(actor: CooperativeActor, actions: SelectedActions, n: int
 
 @cache
 def _variations(n: int, n_parameters: int) -> np.ndarray:
-    """:return: (1, n, Pmax) float32, standard normal, constants for those who export a policy"""
-    return np.random.RandomState(0).standard_normal((1, n, n_parameters)).astype(np.float32)
+    """:return: (n, Pmax) float32, standard normal and their negatives, constants for those who export a policy"""
+    half = np.random.RandomState(0).standard_normal((n // 2, n_parameters)).astype(np.float32)
+    return np.concatenate([half, -half])
 
 
-def varied_candidates(actor: CooperativeActor, actions: SelectedActions, n: int, spread: float) -> Candidates:
+def refined(
+    actor: CooperativeActor, critic: HybridCritic, features: th.Tensor, actions: SelectedActions, n: int, spread: float
+) -> SelectedActions:
     """
-    Actions and n Gaussian variations of the parameters of each, always the same ones.
+    Move the parameters towards Gaussian variations that are worth more, always the same ones.
+
+    The move is their mean with softmax weights, in units of the values' spread (as in Williams et al., 2017): continuous in
+    the values, unlike the best variation, which rounding would choose where values are close.
 
     :param actor: the policies
+    :param critic: twin critic
+    :param features: (B, features_dim) features of the observations
     :param actions: actions of B observations
-    :param n: number of variations per action
+    :param n: even number of variations per action
     :param spread: their standard deviation
-    :return: candidates of B observations, the given action first, n + 1 in all
+    :return: the actions with other parameters
     """
     latents, k, parameters = actions
-    noise = th.as_tensor(_variations(n, parameters.shape[1]), device=parameters.device)
+    moves = spread * th.as_tensor(_variations(n, parameters.shape[1]), device=parameters.device)[None]
     mask = actor.mask(k)
-    varied = (parameters[:, None] + spread * (noise if mask is None else noise * mask[:, None])).clamp(-1, 1)
-    return Candidates(
-        latents[:, None].expand(-1, n + 1, -1),
-        k[:, None].expand(-1, n + 1, *k.shape[1:]),
-        th.cat([parameters[:, None], varied], dim=1),
-    )
+    moves = moves.expand(parameters.shape[0], -1, -1) if mask is None else moves * mask[:, None]
+    varied = (parameters[:, None] + moves).clamp(-1, 1)
+    values = Candidates(latents[:, None].expand(-1, n, -1), k[:, None], varied).values(critic, features)
+    scores = (values - values.mean(dim=1, keepdim=True)) / (values.std(dim=1, keepdim=True) + FLAT_VALUES)
+    # Moves as they were before they were clamped: parameters at a bound stay there if what lies inside is worth less
+    moved = parameters + (scores.softmax(dim=1)[:, :, None] * moves).sum(dim=1)
+    return SelectedActions(latents, k, moved.clamp(-1, 1))
 
 
 @dataclass(frozen=True)
 class Selection:
     """
-    A rule which actions compete. The one of highest min(Q1, Q2) is taken.
+    A rule which actions compete. The one of highest min(Q1, Q2) is taken, and refined if ``n_refined`` is not 0.
 
     :param n_drawn: number of actions per observation that both policies draw
     :param n_uniform: number of uniformly random discrete actions with parameters of the continuous policy
     :param n_random: number of uniformly random actions
     :param n_changed: number of discrete actions that take the place of that of the best of all these, for spaces in which all
         share their parameters
-    :param n_refined: number of variations of the parameters of the best of all these, in each of two rounds with standard
-        deviations of ``REFINEMENT_SPREADS`` of the scaled parameters
+    :param n_refined: number of variations towards which the parameters of the best of all these move, in each of two rounds
+        with standard deviations of ``REFINEMENT_SPREADS`` of the scaled parameters; see :func:`refined`
     """
 
     n_drawn: int
@@ -218,5 +238,5 @@ class Selection:
             candidates = changed_candidates(actor, best, self.n_changed, fixed is not None)
             best = candidates.best(critic, features, allowed(candidates))
         for spread in REFINEMENT_SPREADS if self.n_refined > 0 else ():
-            best = varied_candidates(actor, best, self.n_refined, spread).best(critic, features)
+            best = refined(actor, critic, features, best, self.n_refined, spread)
         return best

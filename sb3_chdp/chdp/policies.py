@@ -31,7 +31,7 @@ RANDOM_LATENT_NOISE = 0.1
 MAX_ALTERNATIVES = 64
 # Uniformly random actions that compete
 N_RANDOM_CANDIDATES = 64
-# Variations of the best action that compete in deterministic predictions
+# Variations towards which deterministic predictions move the best action's parameters
 N_REFINEMENT_CANDIDATES = 16
 # Actions drawn, and as many alternatives, of which the best is the next action in targets: the best of several acts, too
 N_NEXT_ACTIONS = 2
@@ -183,10 +183,6 @@ class CHDPPolicy(HybridPolicy):
 
         :return: (B, columns) rows
         """
-        if deterministic and self.select_deterministic.n_refined > 0 and th.compiler.is_exporting():
-            raise NotImplementedError(
-                "CHDP cannot be exported yet: refined actions are so close in value that a runtime's rounding chooses"
-            )
         features = self.critic_target.features(observation)
         if deterministic:
             select, actor, fixed = self.select_deterministic, self.actor_target, self._fixed_draws(observation)
