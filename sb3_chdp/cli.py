@@ -56,6 +56,8 @@ SCRIPTS = {
 COMMANDS = (*SCRIPTS, "benchmark")
 # Scripts that import the modules of --gym-packages themselves, and note them among a run's arguments
 IMPORTERS = ("train", "optimize", "enjoy")
+# Scripts that play a model
+PLAYERS = ("enjoy", "record", "push_to_hub")
 # What rl_zoo3 2.9.2 imports, declared by it or not
 REQUIRED = ("rl_zoo3", "requests", "pandas", "tensorboard")
 BENCHMARK_REQUIRED = (*REQUIRED, "rliable", "submitit", "filelock")
@@ -98,9 +100,11 @@ def run_script(command: str, arguments: list[str]) -> None:
     :param arguments: what the user wrote behind it
     :raises ArgumentsError: if the command does not work with them
     """
-    from sb3_chdp.zoo import register
+    from sb3_chdp.zoo import play_with_masks, register
 
     register()
+    if command in PLAYERS:
+        play_with_masks()
     others, packages = split_option(arguments, "--gym-packages")
     import_packages(packages)
     if command not in IMPORTERS:

@@ -4,15 +4,17 @@ from typing import Any
 
 import gymnasium as gym
 import rl_zoo3.exp_manager
+import rl_zoo3.utils
 import yaml
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
+from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3.common import callbacks
 from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_chdp
-from sb3_chdp.common.base_class import HYBRID_SPACES
+from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.evaluation import evaluate_policy
 from sb3_chdp.registry import ALGORITHMS
 
@@ -31,6 +33,31 @@ def register() -> None:
     vars(rl_zoo3.exp_manager).update(sb3_chdp=sb3_chdp, ExperimentManager=HybridExperimentManager)
     # Its evaluations are those of SB3's EvalCallback, which knows no masks
     vars(callbacks).update(evaluate_policy=evaluate_policy)
+
+
+def play_with_masks() -> None:
+    """
+    Let a script of rl_zoo3 that plays a model, which it has not imported yet, hand the masks of its environment to ``predict``.
+
+    It makes one environment and loads one model, whose ``predict`` it calls without masks.
+    """
+    create_test_env, predict = rl_zoo3.utils.create_test_env, HybridAlgorithm.predict
+
+    def create(*args: Any, **kwargs: Any) -> VecEnv:
+        env = create_test_env(*args, **kwargs)
+
+        def predict_masked(self: HybridAlgorithm, *args: Any, **kwargs: Any) -> Any:
+            if self.use_masking:
+                kwargs.setdefault("action_masks", get_action_masks(env))
+            return predict(self, *args, **kwargs)
+
+        if is_masking_supported(env):
+            setattr(HybridAlgorithm, "predict", predict_masked)
+        return env
+
+    # The scripts take it from either
+    for module in (rl_zoo3, rl_zoo3.utils):
+        vars(module).update(create_test_env=create)
 
 
 class HybridExperimentManager(ExperimentManager):

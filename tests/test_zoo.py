@@ -230,3 +230,39 @@ def test_yaml_files_are_complete(algorithm):
     assert all(settings[env_id] == settings[f"sb3_chdp/{env_id}"] for env_id in own)
     for env_settings in settings.values():
         assert {"n_timesteps", "policy"} <= set(env_settings)
+
+
+MASKED_ENV = """
+import gymnasium as gym
+import numpy as np
+
+from tests.hybrid_envs import MaskedEnv
+
+
+class MaskedPicture(MaskedEnv):
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}
+
+    def __init__(self, render_mode=None):
+        super().__init__()
+        self.render_mode = render_mode
+
+    def render(self):
+        return np.zeros((16, 16, 3), np.uint8)
+
+
+gym.register("Masked-v0", MaskedPicture)
+"""
+
+
+def test_models_are_played_with_masks(tmp_path, monkeypatch):
+    """The environment raises for what it forbids: while it is trained, evaluated, watched, recorded and published."""
+    (tmp_path / "masked.py").write_text(MASKED_ENV)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+    run("train", "--env", "Masked-v0", "--gym-packages", "masked", "-n", "60", "--eval-freq", "30", "--eval-episodes", "2",
+        "-params", *small("chdp"), cwd=tmp_path)  # fmt: skip
+    # Three actions, of which most states forbid two: nobody comes through 100 steps by chance
+    assert "10 Episodes" in run("enjoy", "--gym-packages", "masked", "--no-render", "-n", "100", cwd=tmp_path)
+    run("enjoy", "--gym-packages", "masked", "--no-render", "-n", "50", "--n-envs", "2", "--stochastic", cwd=tmp_path)
+    run("record", "--gym-packages", "masked", "-n", "30", cwd=tmp_path)
+    assert list((tmp_path / "logs").glob("*/*/videos/*.mp4"))
+    run("push_to_hub", "--gym-packages", "masked", "-orga", "me", "--no-upload", "--eval-episodes", "5", "-n", "20", cwd=tmp_path)
