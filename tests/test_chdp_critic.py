@@ -1,6 +1,5 @@
 """What the critics of CHDP see, and what they can fit for it."""
 
-import pytest
 import torch as th
 
 from sb3_chdp.chdp.critic import AttentionReads, QNetwork

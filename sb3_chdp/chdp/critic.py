@@ -9,7 +9,6 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-
 # Of the logits: such attention starts even and learns as fast as the rest
 SHARPNESS = 3.0
 
@@ -54,8 +53,8 @@ class QNetwork(nn.Module):
     Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a. The last hidden layers are normalised, which bounds Q
     where there is no data (Ball et al., 2023), not the ones before, which would lose how large their inputs are.
 
-    A sees what the latent reads of the features, see :class:`AttentionReads`, and the products of all entries of the latent with
-    all parameters: what a parameter does depends on the discrete action, often by a factor. V and A are not told apart
+    A sees what the latent reads of the features, see :class:`AttentionReads`, and the products of all its entries with all
+    parameters: what a parameter does depends on the discrete action, often by a factor. V and A are not told apart
     further: V learns what does not depend on the action (as in Wang et al., 2016).
 
     :param features_dim: number of features of the state
