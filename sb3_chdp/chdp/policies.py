@@ -161,8 +161,8 @@ class CHDPPolicy(HybridPolicy):
         acting = Selection(
             self.n_action_candidates, n_random=N_RANDOM_CANDIDATES, **{alternatives: min(n_values, MAX_ALTERNATIVES)}
         )
-        target = Selection(N_NEXT_ACTIONS, by_q1=True, **{alternatives: min(n_values, N_NEXT_ACTIONS)})
-        return acting, replace(acting, n_refined=N_REFINEMENT_CANDIDATES), target
+        target = Selection(N_NEXT_ACTIONS, **{alternatives: min(n_values, N_NEXT_ACTIONS)})
+        return acting, replace(acting, n_refined=N_REFINEMENT_CANDIDATES), replace(target, by_q1=True)
 
     def _make_optimizer(self, network: nn.Module, lr_schedule: Schedule) -> th.optim.Optimizer:
         parameters = list(network.parameters())
