@@ -64,10 +64,9 @@ def check(model, tmp_path, n=N):
     example, observations = (as_tensors(batch_of(space, size)) for size in (2, n))
     both = export(model, tmp_path / "policy.onnx", observations, example)
 
-    in_numpy = (
-        {key: part.numpy() for key, part in observations.items()} if isinstance(space, spaces.Dict) else observations.numpy()
-    )
-    actions, _ = model.predict(in_numpy, deterministic=True)
+    is_dict = isinstance(observations, dict)
+    arrays = {key: part.numpy() for key, part in observations.items()} if is_dict else observations.numpy()
+    actions, _ = model.predict(arrays, deterministic=True)
     spec = model.policy.action_space.spec
     expected = np.stack([spec.to_row(action) for action in actions])
     choices, own_parameters = spec.columns.discrete_actions(expected), spec.columns.view(expected, "parameters")

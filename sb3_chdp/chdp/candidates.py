@@ -64,33 +64,28 @@ class Candidates(NamedTuple):
         batch_size = self.latents.shape[0]
         return Candidates(*(th.cat([a, b.expand(batch_size, *b.shape[1:])], dim=1) for a, b in zip(self, others, strict=True)))
 
-    def values(self, critic: HybridCritic, features: th.Tensor, by_q1: bool = False) -> th.Tensor:
+    def values(self, critic: HybridCritic, features: th.Tensor) -> th.Tensor:
         """
         :param critic: twin critic
         :param features: (B, features_dim) features of the observations
-        :param by_q1: whether to spare Q2
-        :return: (B, n) min(Q1, Q2), or Q1
+        :return: (B, n) min(Q1, Q2)
         """
         n = self.latents.shape[1]
         inputs = features.repeat_interleave(n, dim=0), self.latents.flatten(0, 1), self.parameters.flatten(0, 1)
-        q_values = critic.q1_values(*inputs) if by_q1 else th.min(*critic.q_values(*inputs))
-        return q_values.view(-1, n)
+        return th.min(*critic.q_values(*inputs)).view(-1, n)
 
-    def best(
-        self, critic: HybridCritic, features: th.Tensor, allowed: th.Tensor | None = None, by_q1: bool = False
-    ) -> SelectedActions:
+    def best(self, critic: HybridCritic, features: th.Tensor, allowed: th.Tensor | None = None) -> SelectedActions:
         """
         :param critic: twin critic
         :param features: (B, features_dim) features of the observations
         :param allowed: (B, n) which candidates may be taken, None: all
-        :param by_q1: whether to spare Q2
-        :return: the candidates of highest min(Q1, Q2), or Q1, among those that may be taken
+        :return: the candidates of highest min(Q1, Q2) among those that may be taken
         """
         batch_size, n = self.latents.shape[:2]
         latents, k, parameters = (part.flatten(0, 1) for part in self)
         if n == 1:  # nothing to choose
             return SelectedActions(latents, k, parameters)
-        values = self.values(critic, features, by_q1)
+        values = self.values(critic, features)
         if allowed is not None:
             values = values.masked_fill(~allowed, -th.inf)
         best = values.argmax(dim=1) + th.arange(batch_size, device=features.device) * n
@@ -208,7 +203,6 @@ class Selection:
         share their parameters
     :param n_refined: number of variations towards which the parameters of the best of all these move, in each of two rounds
         with standard deviations of ``REFINEMENT_SPREADS`` of the scaled parameters; see :func:`refined`
-    :param by_q1: whether Q1 alone chooses
     """
 
     n_drawn: int
@@ -216,7 +210,6 @@ class Selection:
     n_random: int = 0
     n_changed: int = 0
     n_refined: int = 0
-    by_q1: bool = False
 
     def __call__(
         self,
@@ -240,10 +233,10 @@ class Selection:
         candidates = drawn_candidates(actor, features, self.n_drawn, self.n_uniform, fixed, masks)
         if self.n_random > 0:
             candidates = candidates.join(random_candidates(actor, features.shape[0], self.n_random, fixed))
-        best = candidates.best(critic, features, allowed(candidates), self.by_q1)
+        best = candidates.best(critic, features, allowed(candidates))
         if self.n_changed > 0:
             candidates = changed_candidates(actor, best, self.n_changed, fixed is not None)
-            best = candidates.best(critic, features, allowed(candidates), self.by_q1)
+            best = candidates.best(critic, features, allowed(candidates))
         for spread in REFINEMENT_SPREADS if self.n_refined > 0 else ():
             best = refined(actor, critic, features, best, self.n_refined, spread)
         return best

@@ -48,7 +48,7 @@ class CHDP(HybridOffPolicyAlgorithm):
            the buffer that no longer decode to the action taken give way to its present codeword, see ``train/latent_drift``;
         4. of several actions the one of highest Q acts, and is the next action in targets, see :class:`Selection`;
         5. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
-           stored ones, and the continuous policy for uniformly random discrete actions too, both with half of the batch;
+           stored ones, and the continuous policy for uniformly random discrete actions too;
         6. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate` and
            :func:`vary_parts`;
         7. the learning rate falls linearly to 0.
@@ -103,8 +103,6 @@ class CHDP(HybridOffPolicyAlgorithm):
     takes_factored = True
     # Share of uniformly random discrete actions for which the continuous policy is improved
     uniform_fraction: ClassVar[float] = 0.5
-    # Share of the batch that the policies are updated with; half of it costs little in learning, and not half the time
-    policy_batch_fraction: ClassVar[float] = 0.5
     # Whether the critics' loss trains the codebook
     critics_train_codebook: ClassVar[bool] = True
     # Bound on the gradient norm of every network
@@ -236,8 +234,7 @@ class CHDP(HybridOffPolicyAlgorithm):
 
             if self._n_updates % self.policy_delay == 0:
                 alpha = self.eta / q_values.abs().mean().clamp(min=1e-6)
-                n = max(1, round(self.policy_batch_fraction * len(features)))
-                replay_data, features = replay_data.stored_actions(n), features.detach()[:n]
+                features = features.detach()
 
                 # Step 1: discrete policy, eq. 7
                 parameters = self._parameters_of_latents(replay_data)

@@ -26,7 +26,7 @@ def target_values(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> th.Te
     """
     Eq. 11, y = r + gamma min_j Q'_j(s', e', a') of the best next action (e', a') among a few of the target policies.
 
-    The online Q1 chooses and the targets value, so that an error has to be in both to raise y (double Q-learning, van
+    The online critics choose and the targets value, so that an error has to be in both to raise y (double Q-learning, van
     Hasselt et al., 2016).
 
     :param policy: the networks

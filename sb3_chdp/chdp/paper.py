@@ -113,7 +113,6 @@ class PaperCHDP(CHDP):
         "MultiInputPolicy": PaperMultiInputPolicy,
     }
     uniform_fraction: ClassVar[float] = 0.0
-    policy_batch_fraction: ClassVar[float] = 1.0
     critics_train_codebook: ClassVar[bool] = False
 
     def __init__(

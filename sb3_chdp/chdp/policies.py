@@ -162,7 +162,7 @@ class CHDPPolicy(HybridPolicy):
             self.n_action_candidates, n_random=N_RANDOM_CANDIDATES, **{alternatives: min(n_values, MAX_ALTERNATIVES)}
         )
         target = Selection(N_NEXT_ACTIONS, **{alternatives: min(n_values, N_NEXT_ACTIONS)})
-        return acting, replace(acting, n_refined=N_REFINEMENT_CANDIDATES), replace(target, by_q1=True)
+        return acting, replace(acting, n_refined=N_REFINEMENT_CANDIDATES), target
 
     def _make_optimizer(self, network: nn.Module, lr_schedule: Schedule) -> th.optim.Optimizer:
         parameters = list(network.parameters())

@@ -34,15 +34,6 @@ class HybridReplaySamples(NamedTuple):
     masks: th.Tensor | None = None
     next_masks: th.Tensor | None = None
 
-    def stored_actions(self, n: int) -> "HybridReplaySamples":
-        """:return: the batch with only the first n of its actions and masks"""
-        return self._replace(
-            discrete_actions=self.discrete_actions[:n],
-            parameters=self.parameters[:n],
-            latents=self.latents[:n],
-            masks=None if self.masks is None else self.masks[:n],
-        )
-
 
 def name_columns(
     replay_data: ReplayBufferSamples | PrioritizedReplayBufferSamples, action_space: HybridBox, gamma: float
