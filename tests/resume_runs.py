@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import sb3_chdp
 from sb3_chdp import PATD3
+from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.resume import ResumableCheckpoint, resume
 from tests.algorithms import make_model
 from tests.hybrid_envs import UNIT
@@ -97,6 +98,8 @@ def trained(folder, total=60, n_envs=1, save_freq=10, checkpoint=ResumableCheckp
 RUNS = {
     "CHDP-1": {},
     "CHDP-4": dict(n_steps=3),
+    "PaperCHDP-1": dict(n_diffusion_steps=2),
+    "PaperCHDP-4": dict(n_diffusion_steps=2, replay_buffer_class=PrioritizedReplayBuffer),
     "HPPO-1": {},
     "HPPO-4": {},
     "PATD3-1": {},

@@ -71,14 +71,8 @@ BAD = {
     "latent_dim": COUNT,
     "n_diffusion_steps": COUNT,
     "eta": AT_LEAST_0,
-    "uniform_fraction": FRACTION,
     "n_action_candidates": COUNT,
-    "n_random_candidates": AT_LEAST_0,
-    "n_refinement_candidates": AT_LEAST_0,
-    "n_target_candidates": COUNT,
     "codebook_lr_factor": AT_LEAST_0,
-    "critics_train_codebook": SWITCH,
-    "explore_parts": SWITCH,
 }
 # Objects, whose classes check them
 UNCHECKED = {

@@ -101,6 +101,25 @@ def test_damaged_checkpoints_of_a_run(tmp_path):
         train(run)
 
 
+def test_checkpoints_without_settings_are_not_used(tmp_path):
+    """Who deletes a damaged ``started.json``, as its message says, trains anew."""
+    run = make_run(tmp_path, n_timesteps=20_000)
+    process = started(run)
+    try:
+        wait_for(lambda: list(run.checkpoints.glob("0*_steps")))
+    finally:
+        process.kill()
+        process.wait()
+    run.started.write_text("{")
+    changed = replace(run, overrides={**run.overrides, "gamma": 0.5, "n_timesteps": 240})
+    with pytest.raises(ResultsError, match=r"started\.json is damaged .*: delete it, and the run is trained anew"):
+        train(changed)
+    run.started.unlink()
+    train(changed)
+    meta = json.loads(run.json.read_text())
+    assert meta["resumed_at"] == 0 and meta["settings"]["gamma"] == "0.5"
+
+
 def test_gradient_steps_of_on_policy_algorithms(tmp_path):
     run = make_run(tmp_path)
     train(run)

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_chdp import HPPO, PATD3
@@ -211,6 +213,17 @@ def test_observations_of_another_shape(algorithm):
         model.learn(60)
     with pytest.raises(ValueError, match=r"shape \(1,\)"):
         model.predict(np.zeros(1, dtype=np.float32))
+
+
+@pytest.mark.parametrize("std", [np.nan, 1e30], ids=str)
+def test_action_noise_is_refused(off_policy_algorithm, std):
+    model = make_model(off_policy_algorithm, make_vec_env(make_shared_env, 2))
+    size = model.policy.noise_dim
+    model.action_noise = NormalActionNoise(np.zeros(size), np.full(size, std))
+    with pytest.raises(ValueError, match=r"action_noise must be finite .* from environment\(s\) \[0, 1\]"):
+        model.learn(60)
+    # The random actions before are stored
+    assert model.replay_buffer.size() == 6 and is_finite(model)
 
 
 @pytest.mark.parametrize(

@@ -63,6 +63,9 @@ def train(run: Run) -> str:
 
 
 def _train(run: Run, settings: dict[str, str]) -> str:
+    if not run.started.exists():
+        # Without it nobody knows with which settings
+        shutil.rmtree(run.checkpoints, ignore_errors=True)
     manager = RunManager(run)
     try:
         made = manager.setup_experiment()

@@ -18,6 +18,7 @@ from stable_baselines3.her import HerReplayBuffer
 from sb3_chdp.common.arguments import FRACTION, SWITCH, TRAIN_FREQ, Accepted, check_device, whole
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.buffer_file import check_buffer, load_buffer, save_buffer
+from sb3_chdp.common.checks import check_numbers
 from sb3_chdp.common.masked_n_step import MaskedNStepReplayBuffer
 from sb3_chdp.common.masks import INFO_KEY, read_masks
 from sb3_chdp.common.policies import HybridPolicy
@@ -261,6 +262,8 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
                 f"action_noise must have size {self.policy.noise_dim} per environment, got shape {np.shape(noise)} "
                 f"for {n_envs} environment(s)"
             )
+        if action_noise is not None:
+            check_numbers("action_noise", np.reshape(noise, (n_envs, -1)))
         obs = self._last_obs
         assert obs is not None, "self._last_obs was not set"
         if noise is None:

@@ -83,8 +83,9 @@ def gradient_step(
     gradients = th.autograd.grad(loss, params, allow_unused=True)
     for p, gradient in zip(params, gradients, strict=True):
         p.grad = gradient
-    # One look for all of it: on a GPU, each look waits for the whole computation
-    value, *norms = th.stack([loss.detach(), *th._foreach_norm([g for g in gradients if g is not None])]).tolist()
+    numbers = [loss.detach(), *th._foreach_norm([g for g in gradients if g is not None])]
+    # A GPU is asked once, as it waits for the whole computation; on the processor stacking costs more than asking
+    value, *norms = th.stack(numbers).tolist() if loss.is_cuda else [number.item() for number in numbers]
     if not (math.isfinite(value) and math.hypot(*norms) <= LARGEST_NORM):
         raise NonFiniteLossError(name, value)
     remaining = iter(norms)
