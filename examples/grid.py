@@ -23,7 +23,7 @@ class Operations(spaces.Dict):
     def from_gym(self, action):
         return self["switch"].from_gym(action["switch"]) + self["generators"].from_gym(action["generators"])
 
-    def close(self):
+    def close(self):  # of GymEnv
         pass
 
 

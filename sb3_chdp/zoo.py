@@ -37,9 +37,9 @@ def register() -> None:
 
 def play_with_masks() -> None:
     """
-    Let a script of rl_zoo3, not imported yet, that plays a model hand the masks of its environment to ``predict``.
+    Let a script that plays a model hand the masks of its environment to ``predict``. To be called before it is imported.
 
-    It makes one environment and loads one model, whose ``predict`` it calls without masks.
+    Such a script makes one environment and loads one model, whose ``predict`` it calls without masks.
     """
     create_test_env, predict = rl_zoo3.utils.create_test_env, HybridAlgorithm.predict
 

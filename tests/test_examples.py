@@ -13,7 +13,14 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "examples"
 # Script to the package that it needs
-PACKAGES = {"sliding": None, "shoot": "hybrid_shoot", "uav": "pyRDDLGym", "rover": "pyRDDLGym", "cogen": "sustaingym"}
+PACKAGES = {
+    "sliding": None,
+    "shoot": "hybrid_shoot",
+    "uav": "pyRDDLGym",
+    "rover": "pyRDDLGym",
+    "cogen": "sustaingym",
+    "grid": "grid2op",
+}
 HELPERS = {"compare", "sliding_env"}
 RETURNS = ("random actions", "simple rule", "before training", "after training")
 

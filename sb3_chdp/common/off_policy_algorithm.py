@@ -262,7 +262,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
                 f"action_noise must have size {self.policy.noise_dim} per environment, got shape {np.shape(noise)} "
                 f"for {n_envs} environment(s)"
             )
-        if action_noise is not None:
+        if noise is not None:
             check_numbers("action_noise", np.reshape(noise, (n_envs, -1)))
         obs = self._last_obs
         assert obs is not None, "self._last_obs was not set"
