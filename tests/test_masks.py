@@ -16,7 +16,7 @@ from sb3_chdp import HHQNTD3, HPPO, PATD3, PDQNTD3, HyARTD3, HybridActionSpec
 from sb3_chdp.common.evaluation import evaluate_policy
 from sb3_chdp.common.masks import read_masks
 from sb3_chdp.common.utils import nearest_row
-from tests.algorithms import fast_model, has_learnt, make_model, snapshot
+from tests.algorithms import has_learnt, make_model, snapshot
 from tests.hybrid_envs import FewValidEnv, MaskedEnv, box, layouts, make_layout_env
 
 CLASSES = [pytest.param(line.load_class(), id=name) for name, line in REGISTRY.items()]
