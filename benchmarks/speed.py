@@ -10,11 +10,8 @@ vCPUs, Python 3.11.7): read those ratios as orders of magnitude.
 
 import argparse
 import statistics
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -23,20 +20,19 @@ import stable_baselines3 as sb3
 import torch as th
 from gymnasium import spaces
 from publish import README, replace_section
-from stable_baselines3 import PPO, TD3
+from safety import checkpoints, guards
+from stable_baselines3 import TD3
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from timing import ENV_ID, build, medians
 from torch.profiler import ProfilerActivity, profile
 
 import sb3_chdp
-from sb3_chdp import ALGORITHMS, CHDP, HPPO, PATD3, PDQNTD3, FlattenHybridAction, HybridActionSpec
+from sb3_chdp import ALGORITHMS, CHDP, HPPO, PDQNTD3, FlattenHybridAction, HybridActionSpec
 from sb3_chdp.benchmark.training import machine
 from sb3_chdp.chdp import PaperCHDP
-from sb3_chdp.common.native_env import NativeActionVecEnv
-from sb3_chdp.common.resume import ResumableCheckpoint
 
-ENV_ID = "HardMove6-v0"
 # Of the originals with a uniformly random policy: frames per second for Platform (with numba) and Goal, else steps
 REFERENCE_RATES = {
     "Platform-v0": 21_000,
@@ -66,32 +62,10 @@ class ManyActions(gym.Env):
         return self.reset()[0], 0.0, False, False, {}
 
 
-def medians(
-    functions: list[Callable[[], object]], repeats: int, clock: Callable[[], float] = time.perf_counter
-) -> list[float]:
-    """:return: median seconds of each function, called in turns, after one call to warm up"""
-    durations: list[list[float]] = [[] for _ in functions]
-    for function in functions:
-        function()
-    for _ in range(repeats):
-        for function, values in zip(functions, durations, strict=True):
-            start = clock()
-            function()
-            values.append(clock() - start)
-    return [statistics.median(values) for values in durations]
-
-
 def off_policy() -> dict[str, type[OffPolicyAlgorithm]]:
     """:return: the off-policy algorithms by their display names"""
     classes = {algorithm.display_name: algorithm.load_class() for algorithm in ALGORITHMS.values()}
     return {name: algorithm for name, algorithm in classes.items() if issubclass(algorithm, OffPolicyAlgorithm)}
-
-
-def build(algorithm: type[BaseAlgorithm], env: Any = ENV_ID, n_envs: int = 8, wrapper: Any = None, **kwargs: Any) -> Any:
-    """:return: a model with some data in its replay buffer and no training yet"""
-    vec_env = make_vec_env(env, n_envs, seed=0, wrapper_class=wrapper)
-    settings = dict(seed=0, device="cpu", learning_starts=300, buffer_size=10_000, gradient_steps=0, batch_size=128)
-    return algorithm("MlpPolicy", vec_env, **{**settings, **kwargs}).learn(600)
 
 
 def environments(repeats: int) -> Iterator[str]:
@@ -140,7 +114,7 @@ def conversion(repeats: int) -> Iterator[str]:
 def step(repeats: int) -> Iterator[str]:
     """(a) gradient step against SB3's TD3, all with batches of 128; TD3 on the flattened environment, 2 x 256"""
     cases: list[tuple[str, type[BaseAlgorithm], int, dict[str, Any]]] = [
-        # Every other step of TD3 and of CHDP updates policies
+        # Every other step of TD3 updates its policy
         ("SB3's TD3", TD3, 2, dict(wrapper=FlattenHybridAction, policy_kwargs=dict(net_arch=[256, 256]))),
         ("CHDP", CHDP, 2, {}),
         ("CHDP, 2 x 256", CHDP, 2, dict(policy_kwargs=BIG)),
@@ -266,76 +240,6 @@ def memory(repeats: int) -> Iterator[str]:
             arrays = [value for value in vars(buffer).values() if isinstance(value, np.ndarray)]
             size = sum(array.nbytes for array in arrays) / buffer.buffer_size
             yield f"| {env_id} | {name} | {buffer.actions.shape[-1]} | {size:,.0f} |"
-
-
-def unguarded_step(
-    loss: th.Tensor, optimizers: list[th.optim.Optimizer], max_grad_norm: float | None = None, name: str = ""
-) -> None:
-    """The package's ``gradient_step`` without a look at the numbers."""
-    groups = [[p for group in optimizer.param_groups for p in group["params"]] for optimizer in optimizers]
-    params = [p for group in groups for p in group]
-    for p, gradient in zip(params, th.autograd.grad(loss, params, allow_unused=True), strict=True):
-        p.grad = gradient
-    for optimizer, group in zip(optimizers, groups, strict=True):
-        if max_grad_norm is not None:
-            th.nn.utils.clip_grad_norm_(group, max_grad_norm)
-        optimizer.step()
-
-
-def guards(repeats: int) -> Iterator[str]:
-    """(i) overhead of the guards against NaN and infinity, processor time; batch 128, baselines with 2 x 256"""
-    yield "| step | with guards, ms | without, ms | overhead |\n|---|---|---|---|"
-    big: dict[str, Any] = dict(policy_kwargs=dict(net_arch=[256, 256]))
-    # Whose attribute is replaced, by what, and what is timed
-    cases: list[tuple[str, Any, str, Any, Callable[[], object]]] = []
-    for name, algorithm, kwargs in (("PA-TD3", PATD3, big), ("CHDP", CHDP, {}), ("PaperCHDP", PaperCHDP, {})):
-        model = build(algorithm, **kwargs)
-        module = sys.modules[model.train.__func__.__module__]
-        train = lambda m=model: m.train(2, 128)  # noqa: E731
-        cases.append((f"{name}, two gradient steps", module, "gradient_step", unguarded_step, train))
-    hppo = HPPO("MlpPolicy", make_vec_env(ENV_ID, 8, seed=0), n_steps=128, n_epochs=1, seed=0, device="cpu", **big)
-    hppo.learn(1024)
-    cases.append(("HPPO, 16 minibatches", HPPO, "train", PPO.train, lambda: hppo.train()))
-    acting = build(PATD3, **big)
-    collect = lambda: acting.learn(400, reset_num_timesteps=False)  # noqa: E731
-    plain_step = lambda env: env.venv.step_wait()  # noqa: E731
-    cases.append(("PA-TD3, 400 steps of 8 environments", NativeActionVecEnv, "step_wait", plain_step, collect))
-    for name, owner, attribute, other, call in cases:
-        own = getattr(owner, attribute)
-
-        def run(method: Any, owner: Any = owner, attribute: str = attribute, call: Callable[[], object] = call) -> None:
-            setattr(owner, attribute, method)
-            call()
-
-        guarded, bare = medians([lambda m=own, r=run: r(m), lambda m=other, r=run: r(m)], 20 * repeats, time.process_time)
-        setattr(owner, attribute, own)
-        yield f"| {name} | {1e3 * guarded:.2f} | {1e3 * bare:.2f} | {100 * (guarded / bare - 1):.1f} % |"
-
-
-def checkpoints(repeats: int) -> Iterator[str]:
-    """(j) resumable checkpoints of CHDP with 1e6 transitions, of which 10,000 are new each time"""
-    yield "| environment | transitions in memory, MB | first two, s | later ones, s | two on disk, MB |\n|---|---|---|---|---|"
-    for env_id in ("Platform-v0", "HardMove10-v0"):
-        seconds: list[float] = []
-
-        class Timed(ResumableCheckpoint):
-            def _save(self, seconds: list[float] = seconds) -> None:
-                start = time.perf_counter()
-                super()._save()
-                seconds.append(time.perf_counter() - start)
-
-        model = build(CHDP, env_id, buffer_size=1_000_000, learning_starts=10**9)
-        arrays = [value for value in vars(model.replay_buffer).values() if isinstance(value, np.ndarray)]
-        for array in arrays:
-            array[:] = 1
-        model.replay_buffer.full = True
-        with tempfile.TemporaryDirectory() as folder:
-            model.learn((2 + repeats // 6) * 10_000, Timed(10_000 // 8, folder), reset_num_timesteps=False)
-            # Links count once
-            files = {file.stat().st_ino: file.stat().st_size for file in Path(folder).rglob("*") if file.is_file()}
-        values = (sum(array.nbytes for array in arrays) / 1e6, sum(files.values()) / 1e6)
-        first, later = statistics.mean(seconds[:2]), statistics.median(seconds[2:])
-        yield f"| {env_id} | {values[0]:,.0f} | {first:.2f} | {later:.2f} | {values[1]:,.0f} |"
 
 
 TABLES = {

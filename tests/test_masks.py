@@ -16,7 +16,7 @@ from sb3_chdp import HHQNTD3, HPPO, PATD3, PDQNTD3, HyARTD3, HybridActionSpec
 from sb3_chdp.common.evaluation import evaluate_policy
 from sb3_chdp.common.masks import read_masks
 from sb3_chdp.common.utils import nearest_row
-from tests.algorithms import has_learnt, make_model, snapshot
+from tests.algorithms import fast_model, has_learnt, make_model, snapshot
 from tests.hybrid_envs import FewValidEnv, MaskedEnv, box, layouts, make_layout_env
 
 CLASSES = [pytest.param(line.load_class(), id=name) for name, line in REGISTRY.items()]
@@ -170,6 +170,18 @@ def test_hppo_learns_faster_from_masks_than_from_a_penalty():
         returns[with_masks] = evaluate_policy(model, env, 200)[0]
     assert returns[True] > 0.9
     assert returns[False] < returns[True] - 0.2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_chdp_learns_faster_from_masks_than_from_a_penalty(seed):
+    returns = {}
+    for with_masks in (True, False):
+        env = make_vec_env(lambda w=with_masks: FewValidEnv(w), 4, seed=seed)
+        model = fast_model(env=env, seed=seed, gradient_steps=2).learn(1200)
+        returns[with_masks] = evaluate_policy(model, env, 200)[0]
+    # Chance among the four that are allowed: 0.25
+    assert returns[True] > 0.9
+    assert returns[False] < returns[True] - 0.5
 
 
 def test_rl_zoo3_evaluates_with_masks(monkeypatch):

@@ -265,16 +265,5 @@ def test_models_are_played_with_masks(tmp_path, monkeypatch):
     run("enjoy", "--gym-packages", "masked", "--no-render", "-n", "50", "--n-envs", "2", "--stochastic", cwd=tmp_path)
     run("record", "--gym-packages", "masked", "-n", "30", cwd=tmp_path)
     assert list((tmp_path / "logs").glob("*/*/videos/*.mp4"))
-    run(
-        "push_to_hub",
-        "--gym-packages",
-        "masked",
-        "-orga",
-        "me",
-        "--no-upload",
-        "--eval-episodes",
-        "5",
-        "-n",
-        "20",
-        cwd=tmp_path,
-    )
+    options = "-orga me --no-upload --eval-episodes 5 -n 20".split()
+    run("push_to_hub", "--gym-packages", "masked", *options, cwd=tmp_path)
