@@ -9,7 +9,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-# Of the logits: such attention starts even and learns as fast as the rest
+# Factor of the logits, which start small
 SHARPNESS = 3.0
 
 
