@@ -37,8 +37,8 @@ def test_nearest_codeword_against_brute_force(k, dim, seed):
 def test_usage():
     codebook = Codebook(8, 2)
     usage, perplexity = codebook.usage(th.tensor([0, 0, 3, 3]))
-    assert usage == 0.25 and perplexity == pytest.approx(2)
-    assert codebook.usage(th.tensor([5]))[1] == pytest.approx(1)
+    assert usage.item() == 0.25 and perplexity.item() == pytest.approx(2)
+    assert codebook.usage(th.tensor([5]))[1].item() == pytest.approx(1)
 
 
 def test_codebook_stays_where_the_latents_are():

@@ -153,6 +153,16 @@ def test_logged_values():
     assert logged["train/n_updates"] == 2
 
 
+def test_usage_of_every_leaf_is_logged():
+    env = LayoutEnv(spaces.Dict(units=spaces.MultiBinary(6), mode=spaces.Discrete(32), set=box(-1, 1, 1)))
+    model = filled_model(env)
+    model.train(1, 32)
+    logged = model.logger.name_to_value
+    by_leaf = [logged[f"train/codebook_usage/{leaf}"] for leaf in ("mode", "units")]
+    assert logged["train/codebook_usage"] == pytest.approx((by_leaf[0] + 6 * by_leaf[1]) / 7)
+    assert "train/codebook_perplexity/units" in logged
+
+
 def test_padding_reaches_nothing():
     """Rows, replay buffer and critic see 0 for parameters that the action does not have."""
     model = filled_model(make_layout_env("nested"), policy_delay=1, learning_rate=0.0)

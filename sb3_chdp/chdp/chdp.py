@@ -260,9 +260,19 @@ class CHDP(HybridOffPolicyAlgorithm):
         for name, values in logs.items():
             self.logger.record(f"train/{name}", th.stack(values).mean().item())
         if "continuous_loss" in logs:
-            usage, perplexity = self.actor.codebook.usage(k)
-            self.logger.record("train/codebook_usage", usage)
-            self.logger.record("train/codebook_perplexity", perplexity)
+            self._log_usage(k)
+
+    def _log_usage(self, k: th.Tensor) -> None:
+        """
+        Log how many discrete actions are in use, of a factored space the mean over its choices and that of every leaf.
+
+        :param k: discrete actions of a batch
+        """
+        leaves = self.hybrid_space.spec.choices_of_leaves
+        for name, values in zip(("usage", "perplexity"), self.actor.codebook.usage(k), strict=True):
+            self.logger.record(f"train/codebook_{name}", values.mean().item())
+            for leaf, choices in leaves.items() if len(leaves) > 1 else ():
+                self.logger.record(f"train/codebook_{name}/{leaf}", values[choices].mean().item())
 
     def _latents_of_today(self, replay_data: HybridReplaySamples) -> tuple[HybridReplaySamples, th.Tensor]:
         """:return: the batch with latents that decode to the stored actions, and the share that did not before"""

@@ -76,16 +76,17 @@ class Codebook(nn.Module):
         """
         return masks.gather(1, k)
 
-    def usage(self, k: th.Tensor) -> tuple[float, float]:
+    def usage(self, k: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         How many actions a batch uses.
 
         :param k: (B,) discrete actions
-        :return: share of the K actions that occur, and perplexity of their frequencies: as many, if they were equally frequent
+        :return: (1,) share of the K actions that occur, and (1,) perplexity of their frequencies: as many, if they were
+            equally frequent
         """
         frequencies = th.unique(k, return_counts=True)[1] / len(k)
         perplexity = (-(frequencies * frequencies.log()).sum()).exp()
-        return len(frequencies) / self.n_discrete_actions, perplexity.item()
+        return perplexity.new_full((1,), len(frequencies) / self.n_discrete_actions), perplexity[None]
 
     def project(self) -> None:
         """Move the codewords back into [-1, 1], where the latents are, after a gradient step."""

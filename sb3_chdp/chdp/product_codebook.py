@@ -74,17 +74,17 @@ class ProductCodebook(ProductTable):
         """
         return masks.gather(1, (self.places[:, 0] + k).flatten(1)).view(k.shape).all(dim=2)
 
-    def usage(self, k: th.Tensor) -> tuple[float, float]:
+    def usage(self, k: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         How many values of its choices a batch uses.
 
         :param k: (B, L) discrete actions
-        :return: means over the choices: share of the values that occur, and perplexity of their frequencies
+        :return: (L,) share of the values that occur, and (L,) perplexity of their frequencies
         """
         frequencies = (k[:, :, None] == th.arange(self.exists.shape[1], device=k.device)).float().mean(dim=0)
         usage = (frequencies > 0).sum(dim=1) / self.exists.sum(dim=1)
         perplexity = (-(th.special.xlogy(frequencies, frequencies)).sum(dim=1)).exp()
-        return usage.mean().item(), perplexity.mean().item()
+        return usage, perplexity
 
     def project(self) -> None:
         """Move the codewords back into [-1, 1], where the latents are, after a gradient step."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -143,6 +144,13 @@ class HybridActionSpec:
     def parameter_sizes(self) -> np.ndarray:
         """(K,) number of parameters of every discrete action, (1,) if it is the same for all of a factored space"""
         return self.mask.sum(axis=1)
+
+    @cached_property
+    def choices_of_leaves(self) -> dict[str, slice]:
+        """which of the L choices of a factored space belong to which of its leaves, by the leaves' keys; {} of others"""
+        ends = np.cumsum([0, *(len(leaf.radices) for leaf in self._discrete_leaves)]) if self.is_factored else []
+        names = ["/".join(map(str, leaf.path)) for leaf in self._discrete_leaves]
+        return {name: slice(*pair) for name, pair in zip(names, pairwise(ends), strict=False)}
 
     @property
     def n_mask_values(self) -> int:
