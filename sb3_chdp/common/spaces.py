@@ -148,7 +148,7 @@ class HybridActionSpec:
     @cached_property
     def choices_of_leaves(self) -> dict[str, slice]:
         """which of the L choices of a factored space belong to which of its leaves, by the leaves' keys; {} of others"""
-        ends = np.cumsum([0, *(len(leaf.radices) for leaf in self._discrete_leaves)]) if self.is_factored else []
+        ends: Any = np.cumsum([0, *(len(leaf.radices) for leaf in self._discrete_leaves)]) if self.is_factored else []
         names = ["/".join(map(str, leaf.path)) for leaf in self._discrete_leaves]
         return {name: slice(*pair) for name, pair in zip(names, pairwise(ends), strict=False)}
 
