@@ -18,6 +18,7 @@ from sb3_chdp.common import replay_store
 from sb3_chdp.common.checkpoint_store import DamagedError, GenerationWriter
 from sb3_chdp.common.plain_data import from_bytes, to_bytes
 from sb3_chdp.common.resume import ResumableCheckpoint, resume
+from sb3_chdp.common.serialization import TAG, NotSerializable
 from tests.algorithms import make_model
 from tests.resume_runs import SmallChunks, generations, make_env, trained
 
@@ -234,8 +235,8 @@ def test_nothing_runs_when_state_is_read(tmp_path):
         loaded = np.load(path, allow_pickle=False)
         for name in getattr(loaded, "files", []):
             assert loaded[name].dtype.kind in "biufU"
-    with pytest.raises(TypeError, match="not plain data"):
+    with pytest.raises(NotSerializable, match="print"):
         to_bytes({"x": print})
-    value = {"a": (1, None, float("inf")), 3: [np.float32(0.1), True], "__kind__": "x", "long": [0.1] * 40}
+    value = {"a": (1, None, float("inf")), 3: [np.float32(0.1), True], TAG: "x", "long": [0.1] * 40, "word": np.str_("y")}
     again = from_bytes(*to_bytes(value))
     assert again == value and type(again[3][0]) is np.float32 and type(again["a"]) is tuple and type(again["long"][0]) is float

@@ -13,19 +13,12 @@ from gymnasium.wrappers.utils import RunningMeanStd as GymRunningMeanStd
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
+from sb3_chdp.common.serialization import BIT_GENERATORS, Nested, decode, encode
+
 SCALARS = (type(None), bool, int, float, str)
 DICTS = (dict, OrderedDict)
-# Objects whose own attributes are saved, and put back into the object that is there
+# Objects whose own attributes are saved, as ``Nested``, and put back into the object that is there
 NESTED = (RunningMeanStd, GymRunningMeanStd, StackedObservations)
-BIT_GENERATORS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
-# Lists of so many numbers are written as arrays
-LONG = 32
-# Key of a dict in the JSON that stands for something else
-KIND = "__kind__"
-
-
-class Nested(dict[str, Any]):
-    """The state of an object of the classes ``NESTED``."""
 
 
 def is_plain(value: Any) -> bool:
@@ -106,70 +99,14 @@ def restore_state(obj: Any, state: dict[str, Any]) -> None:
             setattr(obj, name, _restored(getattr(obj, name, None), value))
 
 
-def _encode(value: Any, arrays: list[np.ndarray]) -> Any:
-    def as_array(array: np.ndarray, kind: str, **more: Any) -> dict[str, Any]:
-        arrays.append(array)
-        return {KIND: kind, "array": len(arrays) - 1, **more}
-
-    if type(value) in SCALARS:
-        return value
-    if type(value) is list and len(value) >= LONG and set(map(type, value)) in ({float}, {int}):
-        array = np.array(value)
-        if array.dtype in (np.float64, np.int64):
-            return as_array(array, "list")
-    if type(value) is list:
-        return [_encode(part, arrays) for part in value]
-    if type(value) is tuple:
-        return {KIND: "tuple", "parts": [_encode(part, arrays) for part in value]}
-    if type(value) is deque:
-        return {KIND: "deque", "parts": [_encode(part, arrays) for part in value], "maxlen": value.maxlen}
-    if type(value) in (*DICTS, Nested):
-        pairs = [[_encode(key, arrays), _encode(part, arrays)] for key, part in value.items()]
-        if type(value) is not Nested and all(type(key) is str and key != KIND for key in value):
-            return {key: part for key, (_, part) in zip(value, pairs, strict=True)}
-        return {KIND: "nested" if type(value) is Nested else "dict", "pairs": pairs}
-    if isinstance(value, np.generic):
-        return as_array(np.asarray(value), "scalar")
-    if isinstance(value, np.random.Generator):
-        return {KIND: "generator", "state": _encode(value.bit_generator.state, arrays)}
-    if type(value) is np.ndarray:
-        return as_array(value, "array")
-    raise TypeError(f"not plain data: {value!r}")
-
-
-def _decode(value: Any, arrays: Any) -> Any:
-    if type(value) is list:
-        return [_decode(part, arrays) for part in value]
-    if type(value) is not dict:
-        return value
-    kind = value.get(KIND)
-    if kind is None:
-        return {key: _decode(part, arrays) for key, part in value.items()}
-    if kind in ("array", "scalar", "list"):
-        array = arrays[f"arr_{value['array']}"]
-        return array if kind == "array" else array.tolist() if kind == "list" else array[()]
-    if kind in ("dict", "nested"):
-        pairs = {_decode(key, arrays): _decode(part, arrays) for key, part in value["pairs"]}
-        return Nested(pairs) if kind == "nested" else pairs
-    if kind == "generator":
-        state = _decode(value["state"], arrays)
-        if state["bit_generator"] not in BIT_GENERATORS:
-            raise ValueError(f"unknown bit generator {state['bit_generator']!r}, known are {BIT_GENERATORS}")
-        bit_generator = getattr(np.random, state["bit_generator"])()
-        bit_generator.state = state
-        return np.random.Generator(bit_generator)
-    parts = [_decode(part, arrays) for part in value["parts"]]
-    return tuple(parts) if kind == "tuple" else deque(parts, maxlen=value["maxlen"])
-
-
 def to_bytes(value: Any) -> tuple[bytes, bytes]:
     """
     :param value: plain data
     :return: contents of a JSON file and of the npz file with its arrays
-    :raises TypeError: for other data
+    :raises NotSerializable: for other data
     """
     arrays: list[np.ndarray] = []
-    text = json.dumps(_encode(value, arrays))
+    text = json.dumps(encode(value, arrays))
     file = io.BytesIO()
     np.savez(file, *arrays)
     return text.encode(), file.getvalue()
@@ -182,4 +119,4 @@ def from_bytes(text: bytes, arrays: bytes) -> Any:
     :return: what :func:`to_bytes` was given
     """
     with np.load(io.BytesIO(arrays), allow_pickle=False) as loaded:
-        return _decode(json.loads(text), loaded)
+        return decode(json.loads(text), [loaded[f"arr_{i}"] for i in range(len(loaded.files))])

@@ -1,5 +1,5 @@
 """
-Models, policies and replay buffers as JSON and arrays, which are read without running any code of the file's.
+Models, policies, replay buffers and checkpoints as JSON and arrays, which are read without running any code of the file's.
 
 JSON's own types stand for themselves. Everything else is an object with the key ``TAG``, which names one of the kinds
 below: a file can name them, and nothing beyond them.
@@ -9,7 +9,7 @@ import base64
 import enum
 import sys
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,31 @@ from sb3_chdp.common.hybrid_box import HybridBox
 TAG = ":json:"
 # Arrays with more elements than this are not written as lists of numbers
 LONG = 64
+BIT_GENERATORS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
+
+
+class NotSerializable(TypeError):
+    """The object cannot be written as JSON and arrays."""
+
+
+class Nested(dict[str, Any]):
+    """Attributes that are to be put back into an object, not a value of their own."""
+
+
+def _state_of(generator: np.random.Generator) -> dict[str, Any]:
+    state = generator.bit_generator.state
+    if state["bit_generator"] not in BIT_GENERATORS:
+        raise NotSerializable(f"{generator!r}")
+    return {"state": state}
+
+
+def _generator(state: dict[str, Any]) -> np.random.Generator:
+    if state["bit_generator"] not in BIT_GENERATORS:
+        raise ValueError(f"unknown bit generator {state['bit_generator']!r}, known are {BIT_GENERATORS}")
+    bit_generator = getattr(np.random, state["bit_generator"])()
+    bit_generator.state = state
+    return np.random.Generator(bit_generator)
+
 
 # Constructor arguments of the objects that can be written
 ARGUMENTS: dict[type, Callable[[Any], dict[str, Any]]] = {
@@ -50,20 +75,17 @@ ARGUMENTS: dict[type, Callable[[Any], dict[str, Any]]] = {
     },
     VectorizedActionNoise: lambda noise: {"base_noise": noise.base_noise, "n_envs": noise.n_envs},
     TrainFreq: lambda frequency: frequency._asdict(),
+    np.random.Generator: _state_of,
     deque: lambda queue: {"iterable": list(queue), "maxlen": queue.maxlen},
 }
 # Attributes that objects have beside their arguments (setting ``noises`` would reset them)
 STATE: dict[type, str] = {OrnsteinUhlenbeckActionNoise: "noise_prev", VectorizedActionNoise: "_noises"}
-CONSTRUCTORS = {kind.__name__: kind for kind in ARGUMENTS}
+CONSTRUCTORS: dict[str, Callable[..., Any]] = {kind.__name__: kind for kind in ARGUMENTS} | {"Generator": _generator}
 ENUMS: dict[str, type[enum.Enum]] = {kind.__name__: kind for kind in (TrainFrequencyUnit, GoalSelectionStrategy)}
 
 # Where classes may come from that a file names, and of which kind they may be
 PACKAGES = ("sb3_chdp.", "stable_baselines3.", "sb3_contrib.", "torch.nn.modules.", "torch.optim.")
 CLASSES = (th.nn.Module, th.optim.Optimizer, BaseBuffer, HybridBox)
-
-
-class NotSerializable(TypeError):
-    """The object cannot be written as JSON and arrays."""
 
 
 def qualified_name(kind: type) -> str:
@@ -86,7 +108,10 @@ def _encode_array(array: np.ndarray, arrays: list[np.ndarray] | None) -> dict[st
         # Of HER's replay buffer, which keeps infos on request only
         return {TAG: "empty_dicts", "shape": list(array.shape)}
     if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8:
-        raise NotSerializable(f"an array of {array.dtype}")
+        if arrays is None or array.dtype.hasobject:
+            raise NotSerializable(f"an array of {array.dtype}")
+        arrays.append(array)
+        return {TAG: "array_file", "index": len(arrays) - 1}
     entry = {TAG: "array", "dtype": array.dtype.str, "shape": list(array.shape)}
     bits = np.ascontiguousarray(array).view(f"u{array.dtype.itemsize}")
     if array.size > 1 and (bits == bits.flat[0]).all():
@@ -127,12 +152,12 @@ def encode(value: Any, arrays: list[np.ndarray] | None = None) -> Any:
         return {key: encode(item, arrays) for key, item in value.items()}
     if kind is tuple:
         return {TAG: "tuple", "items": [encode(item, arrays) for item in value]}
-    if kind in (OrderedDict, spaces.Dict):
+    if kind in (dict, Nested, OrderedDict, spaces.Dict):
         return {TAG: kind.__name__, "items": [[encode(key, arrays), encode(item, arrays)] for key, item in value.items()]}
     if kind is np.ndarray:
         return _encode_array(value, arrays)
     if isinstance(value, np.generic):
-        return {TAG: "number", "array": _encode_array(np.asarray(value), None)}
+        return {TAG: "number", "array": _encode_array(np.asarray(value), arrays)}
     if kind in ARGUMENTS:
         entry = {TAG: kind.__name__, "arguments": encode(ARGUMENTS[kind](value), arrays)}
         return {**entry, "state": encode(getattr(value, STATE[kind]), arrays)} if kind in STATE else entry
@@ -170,20 +195,25 @@ def decode(value: Any, arrays: list[np.ndarray] | None = None) -> Any:
         return {key: decode(item, arrays) for key, item in value.items()}
     tag = value[TAG]
     if tag in CONSTRUCTORS:
-        kind = CONSTRUCTORS[tag]
-        made = kind(**decode(value["arguments"], arrays))
-        if kind in STATE:
-            setattr(made, STATE[kind], decode(value["state"], arrays))
+        made = CONSTRUCTORS[tag](**decode(value["arguments"], arrays))
+        if type(made) in STATE:
+            setattr(made, STATE[type(made)], decode(value["state"], arrays))
         return made
+
+    def pairs() -> Iterator[tuple[Any, Any]]:
+        return ((decode(key, arrays), decode(item, arrays)) for key, item in value["items"])
+
     readers: dict[Any, Callable[[], Any]] = {
         "tuple": lambda: tuple(decode(value["items"], arrays)),
-        "OrderedDict": lambda: OrderedDict((decode(key, arrays), decode(item, arrays)) for key, item in value["items"]),
+        "dict": lambda: dict(pairs()),
+        "Nested": lambda: Nested(pairs()),
+        "OrderedDict": lambda: OrderedDict(pairs()),
         "array": lambda: _decode_array(value),
         "array_file": lambda: (arrays or [])[value["index"]],
-        "number": lambda: _decode_array(value["array"])[()],
+        "number": lambda: decode(value["array"], arrays)[()],
         "empty_dicts": lambda: _empty_dicts(value["shape"]),
         # In their order: a plain dict would be sorted
-        "Dict": lambda: spaces.Dict(OrderedDict((decode(key), decode(space)) for key, space in value["items"])),
+        "Dict": lambda: spaces.Dict(OrderedDict(pairs())),
         "hybrid_space": lambda: _find_class(value["class"]["name"], (HybridBox,))(*decode(value["arguments"], arrays)),
         "enum": lambda: ENUMS[value["class"]][value["name"]],
         "class": lambda: _find_class(value["name"]),
