@@ -5,6 +5,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,29 +39,34 @@ def guards(repeats: int) -> Iterator[str]:
     """(i) overhead of the guards against NaN and infinity, processor time; batch 128, baselines with 2 x 256"""
     yield "| step | with guards, ms | without, ms | overhead |\n|---|---|---|---|"
     big: dict[str, Any] = dict(policy_kwargs=dict(net_arch=[256, 256]))
-    # Whose attribute is replaced, by what, and what is timed
-    cases: list[tuple[str, Any, str, Any, Callable[[], object]]] = []
+    # What is replaced, as (owner, attribute, by what), and what is timed
+    cases: list[tuple[str, list[tuple[Any, str, Any]], Callable[[], object]]] = []
     for name, algorithm, kwargs in (("PA-TD3", PATD3, big), ("CHDP", CHDP, {}), ("PaperCHDP", PaperCHDP, {})):
         model = build(algorithm, **kwargs)
         module = sys.modules[model.train.__func__.__module__]
         train = lambda m=model: m.train(2, 128)  # noqa: E731
-        cases.append((f"{name}, two gradient steps", module, "gradient_step", unguarded_step, train))
+        cases.append((f"{name}, two gradient steps", [(module, "gradient_step", unguarded_step)], train))
     hppo = HPPO("MlpPolicy", make_vec_env(ENV_ID, 8, seed=0), n_steps=128, n_epochs=1, seed=0, device="cpu", **big)
     hppo.learn(1024)
-    cases.append(("HPPO, 16 minibatches", HPPO, "train", PPO.train, lambda: hppo.train()))
+    of_losses = (HPPO, "train", PPO.train)
+    cases.append(("HPPO, 16 minibatches", [of_losses], lambda: hppo.train()))
     acting = build(PATD3, **big)
     collect = lambda: acting.learn(400, reset_num_timesteps=False)  # noqa: E731
-    plain_step = lambda env: env.venv.step_wait()  # noqa: E731
-    cases.append(("PA-TD3, 400 steps of 8 environments", NativeActionVecEnv, "step_wait", plain_step, collect))
-    for name, owner, attribute, other, call in cases:
-        own = getattr(owner, attribute)
+    of_data = (NativeActionVecEnv, "step_wait", lambda env: env.venv.step_wait())
+    cases.append(("PA-TD3, 400 steps of 8 environments", [of_data], collect))
+    whole = lambda: hppo.learn(1024, reset_num_timesteps=False)  # noqa: E731
+    cases.append(("HPPO, 1,024 steps of 8 environments and what they teach in one epoch", [of_losses, of_data], whole))
+    for name, replaced, call in cases:
+        own = [(owner, attribute, getattr(owner, attribute)) for owner, attribute, _ in replaced]
 
-        def run(method: Any, owner: Any = owner, attribute: str = attribute, call: Callable[[], object] = call) -> None:
-            setattr(owner, attribute, method)
+        def run(parts: list[tuple[Any, str, Any]], call: Callable[[], object] = call) -> None:
+            for part in parts:
+                setattr(*part)
             call()
 
-        guarded, bare = medians([lambda m=own, r=run: r(m), lambda m=other, r=run: r(m)], 4 * repeats, time.process_time)
-        setattr(owner, attribute, own)
+        guarded, bare = medians([partial(run, own), partial(run, replaced)], 4 * repeats, time.process_time)
+        for part in own:
+            setattr(*part)
         yield f"| {name} | {1e3 * guarded:.2f} | {1e3 * bare:.2f} | {100 * (guarded / bare - 1):.1f} % |"
 
 
