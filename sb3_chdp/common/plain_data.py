@@ -31,7 +31,7 @@ def is_plain(value: Any) -> bool:
         return all(map(is_plain, value.keys())) and all(map(is_plain, value.values()))
     if type(value) is np.ndarray:
         return not value.dtype.hasobject
-    return isinstance(value, np.random.Generator) and type(value.bit_generator).__name__ in BIT_GENERATORS
+    return type(value) is np.random.Generator and type(value.bit_generator).__name__ in BIT_GENERATORS
 
 
 @functools.cache

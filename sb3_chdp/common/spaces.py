@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from functools import cached_property
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -148,9 +147,13 @@ class HybridActionSpec:
     @cached_property
     def choices_of_leaves(self) -> dict[str, slice]:
         """which of the L choices of a factored space belong to which of its leaves, by the leaves' keys; {} of others"""
-        ends: Any = np.cumsum([0, *(len(leaf.radices) for leaf in self._discrete_leaves)]) if self.is_factored else []
-        names = ["/".join(map(str, leaf.path)) for leaf in self._discrete_leaves]
-        return {name: slice(*pair) for name, pair in zip(names, pairwise(ends), strict=False)}
+        choices: dict[str, slice] = {}
+        start = 0
+        for leaf in self._discrete_leaves if self.is_factored else ():
+            end = start + len(leaf.radices)
+            choices["/".join(map(str, leaf.path))] = slice(start, end)
+            start = end
+        return choices
 
     @property
     def n_mask_values(self) -> int:
