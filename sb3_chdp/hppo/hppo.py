@@ -240,22 +240,22 @@ class HPPO(HybridAlgorithm, PPO):
         if not np.isfinite(np.vdot(returns, returns)):
             raise NonFiniteLossError("value_loss")
 
-        max_grad_norm = self.max_grad_norm
-
-        def clip_gradient(optimizer: th.optim.Optimizer, *_: Any) -> None:
-            params = [p for group in optimizer.param_groups for p in group["params"]]
-            if not th.nn.utils.clip_grad_norm_(params, max_grad_norm).isfinite():
-                raise NonFiniteLossError("loss")
-
         # For the time of the call: copies of a model have no hooks
-        hook = self.policy.optimizer.register_step_pre_hook(clip_gradient)
-        # SB3 would clip a gradient of infinite norm to zeros, and learn nothing from then on
-        self.max_grad_norm = math.inf
+        hook = self.policy.optimizer.register_step_pre_hook(self._check_clipped_gradient)
         try:
             super().train()
         finally:
             hook.remove()
-            self.max_grad_norm = max_grad_norm
+
+    def _check_clipped_gradient(self, *_: Any) -> None:
+        """
+        SB3 clips a gradient of infinite norm to zeros, and learns nothing from then on, and one with NaN to nothing but NaN:
+        one number tells, seldom all of them are asked.
+        """
+        gradients = [p.grad for p in self.policy.parameters() if p.grad is not None]
+        last = gradients[-1].sum().item()
+        if math.isnan(last) or (last == 0 and not any(gradient.any() for gradient in gradients)):
+            raise NonFiniteLossError("loss")
 
     def dump_logs(self, iteration: int = 0) -> None:
         if iteration > 0:
