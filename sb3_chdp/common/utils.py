@@ -65,6 +65,22 @@ class NonFiniteLossError(FloatingPointError):
         super().__init__(f"{name} and the squares of its gradient must be finite{got}{details}")
 
 
+def floats(numbers: Sequence[th.Tensor]) -> list[float]:
+    """:return: the values of scalar tensors, all on one device"""
+    # A GPU is asked once, as it waits for the whole computation; on the processor stacking costs more than asking
+    return th.stack(list(numbers)).tolist() if numbers[0].is_cuda else [number.item() for number in numbers]
+
+
+def clip(gradients: list[th.Tensor], norm: float, max_norm: float) -> None:
+    """
+    ``torch.nn.utils.clip_grad_norm_`` for gradients whose common norm is known.
+
+    :param gradients: are scaled in place if ``norm`` is more than ``max_norm``
+    """
+    if norm > max_norm:
+        th._foreach_mul_(gradients, max_norm / norm)
+
+
 def gradient_step(
     loss: th.Tensor, optimizers: list[th.optim.Optimizer], max_grad_norm: float | None = None, name: str = "The loss"
 ) -> None:
@@ -83,18 +99,14 @@ def gradient_step(
     gradients = th.autograd.grad(loss, params, allow_unused=True)
     for p, gradient in zip(params, gradients, strict=True):
         p.grad = gradient
-    numbers = [loss.detach(), *th._foreach_norm([g for g in gradients if g is not None])]
-    # A GPU is asked once, as it waits for the whole computation; on the processor stacking costs more than asking
-    value, *norms = th.stack(numbers).tolist() if loss.is_cuda else [number.item() for number in numbers]
+    value, *norms = floats([loss.detach(), *th._foreach_norm([g for g in gradients if g is not None])])
     if not (math.isfinite(value) and math.hypot(*norms) <= LARGEST_NORM):
         raise NonFiniteLossError(name, value)
     remaining = iter(norms)
     for optimizer, group in zip(optimizers, groups, strict=True):
         if max_grad_norm is not None:
             own = [p.grad for p in group if p.grad is not None]
-            norm = math.hypot(*islice(remaining, len(own)))
-            if norm > max_grad_norm:
-                th._foreach_mul_(own, max_grad_norm / norm)
+            clip(own, math.hypot(*islice(remaining, len(own))), max_grad_norm)
         optimizer.step()
 
 

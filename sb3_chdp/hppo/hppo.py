@@ -29,7 +29,7 @@ from sb3_chdp.common.arguments import (
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox
 from sb3_chdp.common.rollout_buffers import HybridDictRolloutBuffer, HybridRolloutBuffer
-from sb3_chdp.common.utils import NonFiniteLossError
+from sb3_chdp.common.utils import LARGEST_NORM, NonFiniteLossError, clip, floats
 from sb3_chdp.hppo.policies import CnnPolicy, HPPOPolicy, MlpPolicy, MultiInputPolicy
 
 SelfHPPO = TypeVar("SelfHPPO", bound="HPPO")
@@ -240,22 +240,24 @@ class HPPO(HybridAlgorithm, PPO):
         if not np.isfinite(np.vdot(returns, returns)):
             raise NonFiniteLossError("value_loss")
 
+        max_grad_norm = self.max_grad_norm
+
+        def clip_gradient(optimizer: th.optim.Optimizer, *_: Any) -> None:
+            gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+            norm = math.hypot(*floats(th._foreach_norm(gradients)))
+            if not norm <= LARGEST_NORM:
+                raise NonFiniteLossError("loss")
+            clip(gradients, norm, max_grad_norm)
+
         # For the time of the call: copies of a model have no hooks
-        hook = self.policy.optimizer.register_step_pre_hook(self._check_clipped_gradient)
+        hook = self.policy.optimizer.register_step_pre_hook(clip_gradient)
+        # SB3 would clip a gradient of infinite norm to zeros, and learn nothing from then on
+        self.max_grad_norm = math.inf
         try:
             super().train()
         finally:
             hook.remove()
-
-    def _check_clipped_gradient(self, *_: Any) -> None:
-        """
-        SB3 clips a gradient of infinite norm to zeros, and learns nothing from then on, and one with NaN to nothing but NaN:
-        one number tells, seldom all of them are asked.
-        """
-        gradients = [p.grad for p in self.policy.parameters() if p.grad is not None]
-        last = gradients[-1].sum().item()
-        if math.isnan(last) or (last == 0 and not any(gradient.any() for gradient in gradients)):
-            raise NonFiniteLossError("loss")
+            self.max_grad_norm = max_grad_norm
 
     def dump_logs(self, iteration: int = 0) -> None:
         if iteration > 0:
