@@ -11,7 +11,6 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
-from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her import HerReplayBuffer
 
@@ -41,9 +40,6 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
     :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
     :param use_masking: whether to ask the environment for ``action_masks()`` and to take no discrete action that they forbid,
         see :func:`sb3_chdp.common.masks.read_masks`; None: if it has such a method
-    :param exploration_fraction: fraction of the training over which the rate of uniformly random actions is reduced
-    :param exploration_initial_eps: initial probability of a uniformly random action
-    :param exploration_final_eps: final probability of a uniformly random action
     """
 
     accepted_arguments: ClassVar[dict[str, Accepted]] = {
@@ -54,14 +50,9 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         "gradient_steps": whole(-1),
         "optimize_memory_usage": SWITCH,
         "policy_delay": whole(1),
-        "exploration_fraction": FRACTION,
-        "exploration_initial_eps": FRACTION,
-        "exploration_final_eps": FRACTION,
         "use_masking": SWITCH,
     }
     policy: HybridPolicy
-    # Standard deviation of Gaussian noise on what the policy puts out; set by algorithms with a deterministic policy
-    exploration_noise_schedule: Schedule | None = None
 
     def __init__(
         self,
@@ -81,9 +72,6 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         optimize_memory_usage: bool = False,
         n_steps: int = 1,
         action_layout: str = "auto",
-        exploration_fraction: float = 0.1,
-        exploration_initial_eps: float = 1.0,
-        exploration_final_eps: float = 0.05,
         use_masking: bool | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -120,9 +108,6 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
             support_multi_env=True,
         )
         self.action_layout = action_layout
-        self.exploration_fraction = exploration_fraction
-        self.exploration_initial_eps = exploration_initial_eps
-        self.exploration_final_eps = exploration_final_eps
         self.use_masking = self._resolve_masking(use_masking)
 
     def _setup_model(self) -> None:
@@ -141,7 +126,6 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
                 f"buffer_size must be such that the replay buffer fits into the memory, got {self.buffer_size}: {error}. "
                 "optimize_memory_usage=True halves what observations need"
             ) from error
-        self.exploration_schedule = self._exploration_schedule(self.exploration_initial_eps, self.exploration_final_eps)
         self._warn_of_memory()
 
     def _warn_of_memory(self) -> None:
@@ -152,10 +136,6 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
                 f"The actions in the replay buffer will take {n_bytes / 1e9:.1f} GB: {self.replay_buffer.action_dim} numbers "
                 f"for each of buffer_size={self.buffer_size} transitions"
             )
-
-    def _exploration_schedule(self, initial: float, final: float) -> Schedule:
-        """:return: linear schedule that ends after ``exploration_fraction`` of the training"""
-        return LinearSchedule(initial, final, max(self.exploration_fraction, 1e-9))  # it divides by the fraction
 
     def learn(
         self: SelfHybridOffPolicyAlgorithm,
@@ -276,7 +256,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
 
     def _exploration_rate(self) -> float:
         """:return: probability that exploration takes the place of the policy"""
-        return self.exploration_schedule(self._current_progress_remaining)
+        return 0.0
 
     def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator, masks: np.ndarray | None = None) -> np.ndarray:
         """
@@ -314,10 +294,8 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _draw_noise(self, n_envs: int) -> np.ndarray | None:
-        if self.exploration_noise_schedule is None:
-            return None
-        std = self.exploration_noise_schedule(self._current_progress_remaining)
-        return self.action_space.np_random.normal(0.0, std, (n_envs, self.policy.noise_dim))
+        """:return: (n_envs, noise_dim) noise on what the policy puts out if there is no ``action_noise``; None: no noise"""
+        return None
 
     def _on_step(self) -> None:
         super()._on_step()

@@ -9,11 +9,12 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_chdp.common.arguments import SWITCH, Accepted, number, of_networks, optional
+from sb3_chdp.common.arguments import FRACTION, SWITCH, Accepted, number, of_networks, optional
 from sb3_chdp.common.hybrid_box import ScoreBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.policies import HybridPolicy
@@ -151,6 +152,9 @@ class HybridTD3(HybridOffPolicyAlgorithm):
     accepted_arguments: ClassVar[dict[str, Accepted]] = {
         "target_policy_noise": number(),
         "target_noise_clip": number(),
+        "exploration_fraction": FRACTION,
+        "exploration_initial_eps": FRACTION,
+        "exploration_final_eps": FRACTION,
         "exploration_noise": number(),
         "exploration_initial_noise": optional(number()),
         "inverting_gradients": of_networks(SWITCH),
@@ -215,9 +219,6 @@ class HybridTD3(HybridOffPolicyAlgorithm):
             optimize_memory_usage=optimize_memory_usage,
             n_steps=n_steps,
             action_layout=action_layout,
-            exploration_fraction=exploration_fraction,
-            exploration_initial_eps=exploration_initial_eps,
-            exploration_final_eps=exploration_final_eps,
             use_masking=use_masking,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
@@ -232,6 +233,9 @@ class HybridTD3(HybridOffPolicyAlgorithm):
         self.exploration_noise = exploration_noise
         self.exploration_initial_noise = exploration_initial_noise
         self.inverting_gradients = inverting_gradients
+        self.exploration_fraction = exploration_fraction
+        self.exploration_initial_eps = exploration_initial_eps
+        self.exploration_final_eps = exploration_final_eps
 
         if _init_setup_model:
             self._setup_model()
@@ -241,14 +245,23 @@ class HybridTD3(HybridOffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        initial = self.exploration_noise if self.exploration_initial_noise is None else self.exploration_initial_noise
-        self.exploration_noise_schedule = self._exploration_schedule(initial, self.exploration_noise)
+        initial_noise = self.exploration_noise if self.exploration_initial_noise is None else self.exploration_initial_noise
+        fraction = max(self.exploration_fraction, 1e-9)  # a schedule divides by it
+        self.exploration_schedule = LinearSchedule(self.exploration_initial_eps, self.exploration_final_eps, fraction)
+        self.exploration_noise_schedule = LinearSchedule(initial_noise, self.exploration_noise, fraction)
         self._create_aliases()
         self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
 
     def _create_aliases(self) -> None:
         self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
         self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
+
+    def _exploration_rate(self) -> float:
+        return self.exploration_schedule(self._current_progress_remaining)
+
+    def _draw_noise(self, n_envs: int) -> np.ndarray | None:
+        std = self.exploration_noise_schedule(self._current_progress_remaining)
+        return self.action_space.np_random.normal(0.0, std, (n_envs, self.policy.noise_dim))
 
     def train(self, gradient_steps: int, batch_size: int = 128) -> None:
         # Switch to train mode (this affects batch norm / dropout)
