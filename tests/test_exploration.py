@@ -10,34 +10,42 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import exploration
-from sb3_chdp.chdp.exploration import exploration_rate, random_parameters, reflect, vary_parts
+from sb3_chdp.chdp.exploration import (
+    ReturnSums,
+    exploration_rate,
+    informative_steps,
+    random_parameters,
+    reflect,
+    vary_parts,
+)
 from tests.algorithms import fast_model, filled_model, has_learnt, snapshot
 from tests.hybrid_envs import LayoutEnv, box, layouts, make_layout_env
 
 
 def test_the_rate_falls():
-    rates = [exploration_rate(n, n // 1000, 4) for n in (0, 10, 100, 1000, 10_000, 100_000)]
+    rates = [exploration_rate(n, n, n // 1000, 4) for n in (0, 10, 100, 1000, 10_000, 100_000)]
     assert rates[0] == 1 and np.all(np.diff(rates) < 0) and rates[-1] < 0.1
 
 
 @pytest.mark.parametrize("n_actions", [2, 1000])
 def test_half_of_it_is_left_when_the_half_life_is_over(n_actions):
     half_life = exploration.HALF_LIFE + n_actions * exploration.HALF_LIFE_PER_ACTION
-    assert exploration_rate(half_life, 0, n_actions) == pytest.approx(0.5)
+    assert exploration_rate(half_life, half_life, 0, n_actions) == pytest.approx(0.5)
 
 
 def test_more_discrete_actions_take_longer():
-    assert exploration_rate(5000, 0, 1000) > exploration_rate(5000, 0, 10) > exploration_rate(5000, 0, 2)
+    rates = [exploration_rate(5000, 5000, 0, n_actions) for n_actions in (1000, 10, 2)]
+    assert rates[0] > rates[1] > rates[2]
 
 
 def test_some_actions_of_an_episode_keep_exploring():
     """The same number whether episodes are of 20 or 200 steps, but a share at most if they are short."""
     n = 10**7
-    per_episode = [length * exploration_rate(n, n // length, 4) for length in (20, 50, 200)]
+    per_episode = [length * exploration_rate(n, n, n // length, 4) for length in (20, 50, 200)]
     np.testing.assert_allclose(per_episode, exploration.ACTIONS_PER_EPISODE, rtol=1e-3)
-    assert exploration_rate(n, n, 4) == exploration_rate(n, n // 2, 4) == exploration.MAX_FINAL_RATE < 1
+    assert exploration_rate(n, n, n, 4) == exploration_rate(n, n, n // 2, 4) == exploration.MAX_FINAL_RATE < 1
     # Endless episodes end it
-    assert exploration_rate(n, 0, 4) < 0.01
+    assert exploration_rate(n, n, 0, 4) < 0.01
 
 
 def test_it_follows_from_the_steps_whatever_the_length_of_the_training():
@@ -54,6 +62,60 @@ def test_it_follows_from_the_steps_whatever_the_length_of_the_training():
         rates.append(seen[1:])
     assert rates[0] == rates[1] and None not in rates[0]
     assert rates[0][-1] < rates[0][0] <= 1
+
+
+def share_of(returns):
+    sums = ReturnSums()
+    for value in returns:
+        sums = sums.add(value)
+    return sums.informative_share()
+
+
+def test_share_of_informative_returns():
+    rng = np.random.default_rng(0)
+    assert share_of(rng.normal(1e4, 5.0, 1000)) > 0.5 and share_of(rng.uniform(-1e-3, 1e-3, 1000)) > 0.5
+    for rate in (0.01, 0.05):
+        rare = rng.random(5000) < rate
+        assert rate < share_of(100.0 * rare - 7.0) < 5 * rate
+    assert share_of(np.ones(1000)) == 0.0
+    # Too few to tell
+    assert share_of(np.ones(5)) == share_of([]) == 1.0
+
+
+def test_steps_that_told_nothing_do_not_count():
+    rare = ReturnSums(n=1000, mean=0.02, absolute=40.0, square=20.0)
+    assert informative_steps(8, ReturnSums()) == 8 and 0 < informative_steps(8, rare) < 0.5
+    assert exploration_rate(10_000, 200.0, 0, 4) > 0.5 > 0.1 > exploration_rate(10_000, 10_000.0, 0, 4)
+    # A training that begins anew explores anew
+    assert exploration_rate(0, 10_000.0, 0, 4) == 1
+
+
+class Rewarded(LayoutEnv):
+    """An episode of 5 steps, all of them with the same reward, but in one of ``every`` episodes."""
+
+    def __init__(self, every):
+        super().__init__(layouts()["shared"], episode_length=5)
+        self.every, self.n = every, 0
+
+    def reset(self, **kwargs):
+        self.n += 1
+        return super().reset(**kwargs)
+
+    def step(self, action):
+        obs, _, *end = super().step(action)
+        return obs, -1.0 + 10.0 * (self.n % self.every == 0), *end
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_it_explores_on_while_success_is_rare(n_envs):
+    rates = {}
+    for every in (2, 50):
+        model = fast_model(env=DummyVecEnv([lambda every=every: Rewarded(every)] * n_envs), learning_starts=10**9)
+        model.learn(3000, log_interval=10**6)
+        rates[every] = model.logger.name_to_value["rollout/exploration_rate"]
+        assert 0 < model.n_informative_steps <= 3000
+        assert model.return_sums.mean == pytest.approx(-5.0 + 50.0 / every, abs=1.5)
+    assert rates[50] > 2 * rates[2]
 
 
 def test_nobody_needs_to_set_it():

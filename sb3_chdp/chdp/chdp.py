@@ -12,7 +12,7 @@ from stable_baselines3.common.utils import LinearSchedule, update_learning_rate
 
 from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.critic import HybridCritic
-from sb3_chdp.chdp.exploration import exploration_rate, vary_parts
+from sb3_chdp.chdp.exploration import ReturnSums, exploration_rate, informative_steps, vary_parts
 from sb3_chdp.chdp.losses import continuous_policy_loss, critic_loss, discrete_policy_loss, relabel_latents, target_values
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_chdp.common.arguments import Accepted, number, of_networks, warn_of_cost, whole
@@ -49,8 +49,8 @@ class CHDP(HybridOffPolicyAlgorithm):
         4. of several actions the one of highest Q acts, and is the next action in targets, see :class:`Selection`;
         5. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
            stored ones, and the continuous policy for uniformly random discrete actions too;
-        6. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate` and
-           :func:`vary_parts`;
+        6. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate`,
+           :func:`informative_steps` and :func:`vary_parts`;
         7. the learning rate falls linearly to 0.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
@@ -178,6 +178,10 @@ class CHDP(HybridOffPolicyAlgorithm):
         self.codebook_lr_factor = codebook_lr_factor
         self.n_action_candidates = n_action_candidates
         self.policy_delay = policy_delay
+        # What exploration depends on
+        self.n_informative_steps = 0.0
+        self.returns_so_far: list[float] = []
+        self.return_sums = ReturnSums()
 
         if _init_setup_model:
             self._setup_model()
@@ -299,7 +303,27 @@ class CHDP(HybridOffPolicyAlgorithm):
         return latents, k
 
     def _exploration_rate(self) -> float:
-        return exploration_rate(self.num_timesteps, self._episode_num, sum(self.hybrid_space.spec.radices))
+        n_values = sum(self.hybrid_space.spec.radices)
+        return exploration_rate(self.num_timesteps, self.n_informative_steps, self._episode_num, n_values)
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: Any,
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        if len(self.returns_so_far) != self.n_envs:
+            self.returns_so_far = [0.0] * self.n_envs
+        for i, (r, done) in enumerate(zip(reward.tolist(), dones, strict=True)):
+            self.returns_so_far[i] += r
+            if done:
+                self.return_sums = ReturnSums(*self.return_sums).add(self.returns_so_far[i])
+                self.returns_so_far[i] = 0.0
+        self.n_informative_steps += informative_steps(self.n_envs, ReturnSums(*self.return_sums))
 
     def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator, masks: np.ndarray | None = None) -> np.ndarray:
         assert self._last_obs is not None, "self._last_obs was not set"

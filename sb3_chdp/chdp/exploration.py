@@ -1,5 +1,7 @@
 """When and how CHDP explores: a rate that follows from the task, and the parts of a hybrid action varied each on its own."""
 
+from typing import NamedTuple
+
 import numpy as np
 import torch as th
 
@@ -7,25 +9,68 @@ from sb3_chdp.chdp.policies import CHDPPolicy
 
 # After so many steps, and some for each discrete action or value of a choice, every second action still explores
 HALF_LIFE, HALF_LIFE_PER_ACTION = 500, 5
+# Before so many episodes have ended, all steps are informative
+MIN_EPISODES = 10
 # Explored actions of an episode that always remain, unless that is more than a share of all
 ACTIONS_PER_EPISODE, MAX_FINAL_RATE = 1.0, 0.1
 # Smallest and largest standard deviation of the noise on scaled parameters
 NOISE_SCALES = (0.03, 1.0)
 
 
-def exploration_rate(n_steps: int, n_episodes: int, n_values: int) -> float:
+class ReturnSums(NamedTuple):
     """
-    The rate falls with the number n of steps as n0 / (n0 + n), n0 = ``HALF_LIFE`` + K ``HALF_LIFE_PER_ACTION``, whatever the
-    length of the training; ``ACTIONS_PER_EPISODE`` of an episode keep exploring.
+    What is known of the returns of all episodes so far.
+
+    :ivar n: number of episodes
+    :ivar mean: mean return
+    :ivar absolute: sum of absolute differences, each from the mean of the episodes before
+    :ivar square: sum of their squares
+    """
+
+    n: int = 0
+    mean: float = 0.0
+    absolute: float = 0.0
+    square: float = 0.0
+
+    def add(self, value: float) -> "ReturnSums":
+        """:return: the sums with one more return"""
+        difference = value - self.mean if self.n > 0 else 0.0
+        mean = self.mean + (value - self.mean) / (self.n + 1)
+        return ReturnSums(self.n + 1, mean, self.absolute + abs(difference), self.square + difference**2)
+
+    def informative_share(self) -> float:
+        """
+        Share of episodes whose return tells something: 0 if all returns are equal, small if few differ from the others, as
+        where success is rare, 1/2 or more where they spread; the participation ratio of the differences.
+        """
+        if self.n < MIN_EPISODES:
+            return 1.0
+        return self.absolute**2 / (self.n * self.square) if self.square > 0 else 0.0
+
+
+def informative_steps(n_steps: int, returns: ReturnSums) -> float:
+    """
+    :param n_steps: number of steps
+    :param returns: returns of the episodes before
+    :return: for how many steps these count in :func:`exploration_rate`: for fewer where success is rare
+    """
+    return n_steps * min((2 * returns.informative_share()) ** 2, 1)
+
+
+def exploration_rate(n_steps: int, n_informative: float, n_episodes: int, n_values: int) -> float:
+    """
+    The rate falls with the number n of informative steps as n0 / (n0 + n), n0 = ``HALF_LIFE`` + K ``HALF_LIFE_PER_ACTION``,
+    whatever the length of the training; ``ACTIONS_PER_EPISODE`` of an episode keep exploring.
 
     :param n_steps: steps so far
+    :param n_informative: informative steps so far, see :func:`informative_steps`
     :param n_episodes: episodes so far
     :param n_values: number K of discrete actions, in a factored space sum of the radices
     :return: probability of an exploratory action
     """
     half_life = HALF_LIFE + HALF_LIFE_PER_ACTION * n_values
     final = min(ACTIONS_PER_EPISODE * n_episodes / max(n_steps, 1), MAX_FINAL_RATE)
-    return max(half_life / (half_life + n_steps), final)
+    return max(half_life / (half_life + min(n_informative, n_steps)), final)
 
 
 def reflect(x: np.ndarray) -> np.ndarray:
