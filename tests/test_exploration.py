@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import exploration
@@ -77,13 +77,14 @@ def test_share_of_informative_returns():
     for rate in (0.01, 0.05):
         rare = rng.random(5000) < rate
         assert rate < share_of(100.0 * rare - 7.0) < 5 * rate
+        assert share_of(-100.0 * rare) == 1.0
     assert share_of(np.ones(1000)) == 0.0
     # Too few to tell
     assert share_of(np.ones(5)) == share_of([]) == 1.0
 
 
 def test_steps_that_told_nothing_do_not_count():
-    rare = ReturnSums(n=1000, mean=0.02, absolute=40.0, square=20.0)
+    rare = ReturnSums(n=1000, mean=0.02, absolute=40.0, square=20.0, cube=20.0)
     assert informative_steps(8, ReturnSums()) == 8 and 0 < informative_steps(8, rare) < 0.5
     assert exploration_rate(10_000, 200.0, 0, 4) > 0.5 > 0.1 > exploration_rate(10_000, 10_000.0, 0, 4)
     # A training that begins anew explores anew
@@ -106,16 +107,28 @@ class Rewarded(LayoutEnv):
         return obs, -1.0 + 10.0 * (self.n % self.every == 0), *end
 
 
+@pytest.mark.parametrize("wrap", [lambda env: env, VecNormalize])
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_it_explores_on_while_success_is_rare(n_envs):
+def test_it_explores_on_while_success_is_rare(n_envs, wrap):
+    """Returns are those of the environment, normalised or not."""
     rates = {}
     for every in (2, 50):
-        model = fast_model(env=DummyVecEnv([lambda every=every: Rewarded(every)] * n_envs), learning_starts=10**9)
+        env = wrap(DummyVecEnv([lambda every=every: Rewarded(every)] * n_envs))
+        model = fast_model(env=env, learning_starts=10**9)
         model.learn(3000, log_interval=10**6)
         rates[every] = model.logger.name_to_value["rollout/exploration_rate"]
         assert 0 < model.n_informative_steps <= 3000
         assert model.return_sums.mean == pytest.approx(-5.0 + 50.0 / every, abs=1.5)
     assert rates[50] > 2 * rates[2]
+
+
+def test_a_loaded_model_goes_on(tmp_path):
+    model = fast_model(env=Rewarded(50), learning_starts=10**9).learn(203)
+    model.save(tmp_path / "model")
+    loaded = CHDP.load(tmp_path / "model", env=Rewarded(50))
+    assert loaded._exploration_rate() == model._exploration_rate() and loaded.returns_so_far == model.returns_so_far
+    loaded.learn(100, reset_num_timesteps=False)
+    assert loaded.return_sums.n > model.return_sums.n and loaded.n_informative_steps > model.n_informative_steps
 
 
 def test_nobody_needs_to_set_it():

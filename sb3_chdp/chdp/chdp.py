@@ -178,7 +178,7 @@ class CHDP(HybridOffPolicyAlgorithm):
         self.codebook_lr_factor = codebook_lr_factor
         self.n_action_candidates = n_action_candidates
         self.policy_delay = policy_delay
-        # What exploration depends on
+        # What the exploration rate depends on; returns_so_far are those of unfinished episodes, one per environment
         self.n_informative_steps = 0.0
         self.returns_so_far: list[float] = []
         self.return_sums = ReturnSums()
@@ -306,24 +306,20 @@ class CHDP(HybridOffPolicyAlgorithm):
         n_values = sum(self.hybrid_space.spec.radices)
         return exploration_rate(self.num_timesteps, self.n_informative_steps, self._episode_num, n_values)
 
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: Any,
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+    def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any, **kwargs: Any) -> None:
+        super()._store_transition(replay_buffer, *args, **kwargs)
+        # As the environment gave them, within VecNormalize too
+        latest = replay_buffer.pos - 1
+        rewards, dones = replay_buffer.rewards[latest].tolist(), replay_buffer.dones[latest]
         if len(self.returns_so_far) != self.n_envs:
             self.returns_so_far = [0.0] * self.n_envs
-        for i, (r, done) in enumerate(zip(reward.tolist(), dones, strict=True)):
-            self.returns_so_far[i] += r
-            if done:
-                self.return_sums = ReturnSums(*self.return_sums).add(self.returns_so_far[i])
-                self.returns_so_far[i] = 0.0
-        self.n_informative_steps += informative_steps(self.n_envs, ReturnSums(*self.return_sums))
+        self.returns_so_far = [value + reward for value, reward in zip(self.returns_so_far, rewards, strict=True)]
+        returns = ReturnSums(*self.return_sums)  # a list in a loaded model
+        for i in np.flatnonzero(dones):
+            returns = returns.add(self.returns_so_far[i])
+            self.returns_so_far[i] = 0.0
+        self.return_sums = returns
+        self.n_informative_steps += informative_steps(self.n_envs, returns)
 
     def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator, masks: np.ndarray | None = None) -> np.ndarray:
         assert self._last_obs is not None, "self._last_obs was not set"

@@ -9,7 +9,7 @@ from sb3_chdp.chdp.policies import CHDPPolicy
 
 # After so many steps, and some for each discrete action or value of a choice, every second action still explores
 HALF_LIFE, HALF_LIFE_PER_ACTION = 500, 5
-# Before so many episodes have ended, all steps are informative
+# Before so many episodes have ended nobody knows whether success is rare
 MIN_EPISODES = 10
 # Explored actions of an episode that always remain, unless that is more than a share of all
 ACTIONS_PER_EPISODE, MAX_FINAL_RATE = 1.0, 0.1
@@ -25,34 +25,41 @@ class ReturnSums(NamedTuple):
     :ivar mean: mean return
     :ivar absolute: sum of absolute differences, each from the mean of the episodes before
     :ivar square: sum of their squares
+    :ivar cube: sum of their cubes
     """
 
     n: int = 0
     mean: float = 0.0
     absolute: float = 0.0
     square: float = 0.0
+    cube: float = 0.0
 
     def add(self, value: float) -> "ReturnSums":
         """:return: the sums with one more return"""
-        difference = value - self.mean if self.n > 0 else 0.0
-        mean = self.mean + (value - self.mean) / (self.n + 1)
-        return ReturnSums(self.n + 1, mean, self.absolute + abs(difference), self.square + difference**2)
+        n, mean, absolute, square, cube = self
+        d = value - mean if n > 0 else 0.0
+        return ReturnSums(n + 1, mean + (value - mean) / (n + 1), absolute + abs(d), square + d**2, cube + d**3)
 
     def informative_share(self) -> float:
         """
-        Share of episodes whose return tells something: 0 if all returns are equal, small if few differ from the others, as
-        where success is rare, 1/2 or more where they spread; the participation ratio of the differences.
+        Share of episodes whose return tells something, the participation ratio of the differences: 0 if all returns are equal,
+        small if few are better than the others, 0.64 if they are normally distributed, 1 if half of the episodes succeed.
+
+        :return: share in [0, 1]; 1 before ``MIN_EPISODES`` have ended, and if it is the worse returns that are rare
         """
-        if self.n < MIN_EPISODES:
+        if self.n < MIN_EPISODES or self.cube < 0:
             return 1.0
         return self.absolute**2 / (self.n * self.square) if self.square > 0 else 0.0
 
 
 def informative_steps(n_steps: int, returns: ReturnSums) -> float:
     """
+    For how many steps some steps count in :func:`exploration_rate`: all, but fewer where less than half of the episodes tell
+    something.
+
     :param n_steps: number of steps
-    :param returns: returns of the episodes before
-    :return: for how many steps these count in :func:`exploration_rate`: for fewer where success is rare
+    :param returns: returns of the episodes so far
+    :return: n (2 p)^2 and at most n, p from :meth:`ReturnSums.informative_share`
     """
     return n_steps * min((2 * returns.informative_share()) ** 2, 1)
 
