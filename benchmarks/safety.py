@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from timing import ENV_ID, build, medians
 
@@ -39,23 +38,25 @@ def guards(repeats: int) -> Iterator[str]:
     """(i) overhead of the guards against NaN and infinity, processor time; batch 128, baselines with 2 x 256"""
     yield "| step | with guards, ms | without, ms | overhead |\n|---|---|---|---|"
     big: dict[str, Any] = dict(policy_kwargs=dict(net_arch=[256, 256]))
+
+    def of_losses(model: Any) -> tuple[Any, str, Any]:
+        return sys.modules[model.train.__func__.__module__], "gradient_step", unguarded_step
+
     # What is replaced, as (owner, attribute, by what), and what is timed
     cases: list[tuple[str, list[tuple[Any, str, Any]], Callable[[], object]]] = []
     for name, algorithm, kwargs in (("PA-TD3", PATD3, big), ("CHDP", CHDP, {}), ("PaperCHDP", PaperCHDP, {})):
         model = build(algorithm, **kwargs)
-        module = sys.modules[model.train.__func__.__module__]
         train = lambda m=model: m.train(2, 128)  # noqa: E731
-        cases.append((f"{name}, two gradient steps", [(module, "gradient_step", unguarded_step)], train))
+        cases.append((f"{name}, two gradient steps", [of_losses(model)], train))
     hppo = HPPO("MlpPolicy", make_vec_env(ENV_ID, 8, seed=0), n_steps=128, n_epochs=1, seed=0, device="cpu", **big)
     hppo.learn(1024)
-    of_losses = (HPPO, "train", PPO.train)
-    cases.append(("HPPO, 16 minibatches", [of_losses], lambda: hppo.train()))
+    cases.append(("HPPO, 16 minibatches", [of_losses(hppo)], lambda: hppo.train()))
     acting = build(PATD3, **big)
     collect = lambda: acting.learn(400, reset_num_timesteps=False)  # noqa: E731
     of_data = (NativeActionVecEnv, "step_wait", lambda env: env.venv.step_wait())
     cases.append(("PA-TD3, 400 steps of 8 environments", [of_data], collect))
     whole = lambda: hppo.learn(1024, reset_num_timesteps=False)  # noqa: E731
-    cases.append(("HPPO, 1,024 steps of 8 environments and what they teach in one epoch", [of_losses, of_data], whole))
+    cases.append(("HPPO, 1,024 steps of 8 environments and what they teach in one epoch", [of_losses(hppo), of_data], whole))
     for name, replaced, call in cases:
         own = [(owner, attribute, getattr(owner, attribute)) for owner, attribute, _ in replaced]
 

@@ -55,14 +55,13 @@ class NonFiniteLossError(FloatingPointError):
     A loss or its gradient is NaN, infinite, or too large to be squared. No parameter has moved because of it.
 
     :param name: name of the loss in the log
-    :param loss: its value, None if that is not known
+    :param loss: its value
     :param details: where it happened, for the message
     """
 
-    def __init__(self, name: str, loss: float | None = None, details: str = ""):
+    def __init__(self, name: str, loss: float, details: str = ""):
         self.name, self.loss = name, loss
-        got = "" if loss is None else f", got {loss:.6g}"
-        super().__init__(f"{name} and the squares of its gradient must be finite{got}{details}")
+        super().__init__(f"{name} and the squares of its gradient must be finite, got {loss:.6g}{details}")
 
 
 def floats(numbers: Sequence[th.Tensor]) -> list[float]:

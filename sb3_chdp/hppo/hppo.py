@@ -1,6 +1,5 @@
 """Hybrid proximal policy optimization."""
 
-import math
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -12,8 +11,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import obs_as_tensor
+from stable_baselines3.common.utils import explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
+from torch.nn import functional as F
 
 from sb3_chdp.common.arguments import (
     FRACTION,
@@ -29,7 +29,7 @@ from sb3_chdp.common.arguments import (
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox
 from sb3_chdp.common.rollout_buffers import HybridDictRolloutBuffer, HybridRolloutBuffer
-from sb3_chdp.common.utils import LARGEST_NORM, NonFiniteLossError, clip, floats
+from sb3_chdp.common.utils import gradient_step
 from sb3_chdp.hppo.policies import CnnPolicy, HPPOPolicy, MlpPolicy, MultiInputPolicy
 
 SelfHPPO = TypeVar("SelfHPPO", bound="HPPO")
@@ -40,7 +40,6 @@ class HPPO(HybridAlgorithm, PPO):
     Hybrid Proximal Policy Optimization (HPPO)
 
     A categorical policy chooses the discrete action, a Gaussian policy the parameters; each has its own clipped ratio.
-    SB3's ``PPO.train()`` is used as it is: log-probabilities, and so ratios, have two columns.
 
     Paper: Fan et al. (2019), https://arxiv.org/abs/1903.01344. Reference scripts: HyAR repository.
 
@@ -231,33 +230,69 @@ class HPPO(HybridAlgorithm, PPO):
         return True
 
     def train(self) -> None:
-        """
-        SB3's ``train``, which stops before a loss that is not finite moves the policy.
+        # Switch to train mode (this affects batch norm / dropout)
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        clip_range = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]  # schedules by now
+        clip_range_vf = self.clip_range_vf and self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
 
-        :raises NonFiniteLossError: for such a loss
-        """
-        returns = self.rollout_buffer.returns
-        if not np.isfinite(np.vdot(returns, returns)):
-            raise NonFiniteLossError("value_loss")
+        logs: dict[str, list[th.Tensor]] = {}
+        for epoch in range(self.n_epochs):
+            logs["approx_kl"] = []  # of the last epoch
+            for rollout_data in self.rollout_buffer.get(self.batch_size):
+                values, log_prob, entropy = self.policy.evaluate_actions(rollout_data.observations, rollout_data.actions)
+                advantages = rollout_data.advantages
+                if self.normalize_advantage and len(advantages) > 1:
+                    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
 
-        max_grad_norm = self.max_grad_norm
+                # Clipped surrogate loss: one ratio for the discrete action, one for its parameters
+                log_ratio = log_prob - rollout_data.old_log_prob
+                ratio = log_ratio.exp()
+                clipped_ratio = ratio.clamp(1 - clip_range, 1 + clip_range)
+                policy_loss = -th.min(advantages * ratio, advantages * clipped_ratio).mean()
 
-        def clip_gradient(optimizer: th.optim.Optimizer, *_: Any) -> None:
-            gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
-            norm = math.hypot(*floats(th._foreach_norm(gradients)))
-            if not norm <= LARGEST_NORM:
-                raise NonFiniteLossError("loss")
-            clip(gradients, norm, max_grad_norm)
+                values = values.flatten()
+                if clip_range_vf is not None:
+                    change = values - rollout_data.old_values
+                    values = rollout_data.old_values + change.clamp(-clip_range_vf, clip_range_vf)
+                value_loss = F.mse_loss(values, rollout_data.returns)
 
-        # For the time of the call: copies of a model have no hooks
-        hook = self.policy.optimizer.register_step_pre_hook(clip_gradient)
-        # SB3 would clip a gradient of infinite norm to zeros, and learn nothing from then on
-        self.max_grad_norm = math.inf
-        try:
-            super().train()
-        finally:
-            hook.remove()
-            self.max_grad_norm = max_grad_norm
+                assert entropy is not None, "a hybrid distribution knows its entropy"
+                entropy_loss = -entropy.mean()
+                loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss
+
+                log_ratio, ratio = log_ratio.detach(), ratio.detach()
+                minibatch = {
+                    "entropy_loss": entropy_loss,
+                    "policy_gradient_loss": policy_loss,
+                    "value_loss": value_loss,
+                    # http://joschu.net/blog/kl-approx.html
+                    "approx_kl": (ratio - 1 - log_ratio).mean(),
+                    "clip_fraction": ((ratio - 1).abs() > clip_range).float().mean(),
+                }
+                for name, value in minibatch.items():
+                    logs.setdefault(name, []).append(value.detach())
+                too_far = self.target_kl is not None and minibatch["approx_kl"] > 1.5 * self.target_kl
+                if too_far:
+                    break
+                gradient_step(loss, [self.policy.optimizer], self.max_grad_norm, "loss")
+
+            self._n_updates += 1
+            if too_far:
+                if self.verbose >= 1:
+                    print(f"Early stopping at step {epoch} due to reaching max kl: {logs['approx_kl'][-1].item():.2f}")
+                break
+
+        for name, of_minibatches in logs.items():
+            self.logger.record(f"train/{name}", th.stack(of_minibatches).mean().item())
+        self.logger.record("train/loss", loss.item())
+        explained = explained_variance(self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten())
+        self.logger.record("train/explained_variance", explained)
+        self.logger.record("train/std", self.policy.log_std.exp().mean().item())
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/clip_range", clip_range)
+        if clip_range_vf is not None:
+            self.logger.record("train/clip_range_vf", clip_range_vf)
 
     def dump_logs(self, iteration: int = 0) -> None:
         if iteration > 0:
