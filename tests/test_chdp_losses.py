@@ -137,7 +137,7 @@ def test_parameters_with_which_latents_are_valued(parameters):
 
 @BOTH
 def test_target_values(algorithm_class):
-    """y = r + gamma (1 - d) min Q' of the next action that the online critics select; n-step discounts replace gamma."""
+    """r and gamma (1 - d) min Q' of the next action that the online critics select; n-step discounts replace gamma."""
     model = filled_model(algorithm_class=algorithm_class, gamma=0.9)
     policy, critic = model.policy, model.critic_target
     data = sample(model)._replace(dones=(th.arange(32)[:, None] % 2).float())
@@ -148,37 +148,54 @@ def test_target_values(algorithm_class):
         with th.no_grad():
             latents, _, parameters = policy.select_target(policy.actor_target, model.critic, features)
             next_values = policy.value_scale.values(th.min(*critic.q_values(features, latents, parameters)))
-        return data.rewards + discounts * (1 - data.dones) * next_values
+        return th.cat([data.rewards, discounts * (1 - data.dones) * next_values], dim=1)
 
     for discounts in (0.9, th.full((32, 1), 0.1)):
         th.manual_seed(0)
         targets = losses.target_values(policy, data._replace(discounts=discounts))
         th.testing.assert_close(targets, expected(discounts))
-        assert targets.shape == (32, 1) and not targets.requires_grad
-        assert (targets[1::2] == data.rewards[1::2]).all() and (targets[::2] != data.rewards[::2]).any()
+        assert targets.shape == (32, 2) and not targets.requires_grad
+        assert (targets[1::2, 1] == 0).all() and (targets[::2, 1] != 0).all()
 
 
-def test_critic_loss():
-    """The sum of both squared errors, weighted; the larger error is the one that priorities follow."""
+def test_next_values_are_whole_without_foresight():
+    """Foresight matters for the choice of the next action, not for what it is worth."""
     model = filled_model()
-    data, targets = sample(model), th.randn(32, 1)
-    features = model.critic.features(data.observations)
-    q1, q2 = model.critic.q_values(features, data.latents, data.parameters)
-    loss, q_values, errors = losses.critic_loss(model.policy, data._replace(weights=1.0), features, targets)
-    th.testing.assert_close(loss, F.mse_loss(q1, targets) + F.mse_loss(q2, targets))
-    th.testing.assert_close(q_values, q1.detach())
-    th.testing.assert_close(errors, th.cat([q1 - targets, q2 - targets], dim=1).abs().amax(dim=1).detach())
+    data, policy = sample(model), model.policy
+    policy.set_foresight(0.0)
+    features = model.critic_target.features(data.next_observations)
+    th.manual_seed(0)
+    targets = losses.target_values(policy, data._replace(discounts=0.9, dones=0.0))
+    th.manual_seed(0)
+    latents, _, parameters = policy.select_target(policy.actor_target, model.critic, features)
+    policy.set_foresight(1.0)
+    q_values = th.min(*model.critic_target.q_values(features, latents, parameters))
+    th.testing.assert_close(targets[:, 1:], 0.9 * policy.value_scale.values(q_values))
+
+
+@BOTH
+def test_critic_loss(algorithm_class):
+    """The sum of all squared errors, weighted; priorities follow the larger error of both critics."""
+    model = filled_model(algorithm_class=algorithm_class)
+    data, n_parts = sample(model), len(model.critic.part_weights)
+    targets, features = th.randn(32, n_parts), model.critic.features(data.observations)
+    q1, q2 = model.critic.parts(features, data.latents, data.parameters)
+    loss, parts, errors = losses.critic_loss(model.policy, data._replace(weights=1.0), features, targets)
+    th.testing.assert_close(loss, n_parts * (F.mse_loss(q1, targets) + F.mse_loss(q2, targets)))
+    th.testing.assert_close(parts, q1.detach())
+    expected = th.stack([(q - targets).sum(dim=1).abs() for q in (q1, q2)]).amax(dim=0)
+    th.testing.assert_close(errors, expected.detach())
     one = th.zeros(32, 1)
     one[3] = 1.0
     weighted, *_ = losses.critic_loss(model.policy, data._replace(weights=one), features, targets)
-    th.testing.assert_close(weighted, ((q1[3] - targets[3]) ** 2 + (q2[3] - targets[3]) ** 2).squeeze() / 32)
+    th.testing.assert_close(weighted, ((q1[3] - targets[3]) ** 2 + (q2[3] - targets[3]) ** 2).sum() / 32)
 
 
 def test_alpha_normalises_by_q():
     """The discrete loss is L_d - eta / mean|Q| * mean Q: however large the values of the critic are."""
     model = filled_model(learning_rate=0.0, policy_delay=1)
     for critic in (model.critic, model.critic_target):
-        critic.rescale(1000, 0)
+        critic.rescale(th.tensor(1000.0), th.zeros(2))
     model.train(1, 64)
     logged = model.logger.name_to_value
     improvement = logged["train/discrete_loss"] - logged["train/diffusion_loss_discrete"]

@@ -193,7 +193,7 @@ def test_predictions_are_the_best_candidates(deterministic):
     columns, q_networks = model.hybrid_space.columns, model.critic_target.q_networks
     calls, outputs = calls_of(q_networks[0]), [[], []]
     for network, values in zip(q_networks, outputs, strict=True):
-        network.register_forward_hook(lambda module, args, q, values=values: values.append(q.detach()))
+        network.register_forward_hook(lambda module, args, parts, values=values: values.append(parts.detach().sum(dim=1)))
     rows = model.policy.predict_rows(obs, deterministic)
     best = th.min(outputs[0][0], outputs[1][0]).view(6, -1).argmax(dim=1)
     # Deterministic ones are refined: what the parameters are near to

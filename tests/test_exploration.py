@@ -174,7 +174,9 @@ def test_each_part_is_varied():
     n, columns = 4000, model.hybrid_space.columns
     obs = np.random.default_rng(0).uniform(-1, 1, (n, 2)).astype(np.float32)
     rows = model.policy.predict_rows(obs)
-    varied = vary_parts(model.policy, obs, rows, np.random.default_rng(0))
+    with th.no_grad():
+        features = model.critic_target.features(th.as_tensor(obs))
+    varied = vary_parts(model.policy, features, rows, np.random.default_rng(0))
 
     assert set(varied[:, 0]) == {0, 1, 2}
     assert np.abs(varied[:, 1:]).max() <= 1

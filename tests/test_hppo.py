@@ -68,7 +68,9 @@ def test_ratios_are_one_at_first():
 
 
 @pytest.mark.parametrize(
-    "kwargs", [{}, dict(clip_range_vf=0.01), dict(target_kl=1e-4), dict(normalize_advantage=False, max_grad_norm=0.05)], ids=str
+    "kwargs",
+    [{}, dict(clip_range_vf=0.01), dict(target_kl=1e-4), dict(normalize_advantage=False, max_grad_norm=0.05)],
+    ids=str,
 )
 def test_training_is_that_of_ppo(kwargs):
     """SB3's PPO does the same with two log-probabilities per action, but for the guards."""

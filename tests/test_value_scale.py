@@ -13,28 +13,30 @@ from tests.hybrid_envs import HybridIdentityEnv
 
 @pytest.mark.parametrize("spread", [1e-3, 1.0, 1e4])
 def test_outputs_have_zero_mean_and_unit_variance(spread):
-    value_scale, generator = ValueScale(), th.Generator().manual_seed(0)
-    targets = spread * (7 * th.randn(600, 64, 1, generator=generator) - 30)
+    value_scale, generator = ValueScale(2), th.Generator().manual_seed(0)
+    # Rewards of mean 10, and what follows of mean -40: values of mean -30 and standard deviation 5
+    targets = spread * (th.tensor([3.0, 4.0]) * th.randn(600, 64, 2, generator=generator) + th.tensor([10.0, -40.0]))
     for batch in targets:
         value_scale.update(batch)
-    assert value_scale.center.item() == pytest.approx(-30 * spread, rel=0.05)
-    assert value_scale.scale.item() == pytest.approx(7 * spread, rel=0.05)
+    assert value_scale.center.tolist() == pytest.approx([10 * spread, -40 * spread], rel=0.05)
+    assert value_scale.scale.item() == pytest.approx(5 * spread, rel=0.05)
     outputs = value_scale.outputs(targets)
-    assert outputs.std().item() == pytest.approx(1, abs=0.05) and outputs.mean().abs() < 0.1
-    th.testing.assert_close(value_scale.values(outputs), targets, rtol=1e-4, atol=1e-4 * spread)
+    total = outputs.sum(dim=2, keepdim=True)
+    assert total.std().item() == pytest.approx(1, abs=0.05) and outputs.mean(dim=(0, 1)).abs().max() < 0.1
+    th.testing.assert_close(value_scale.values(total), targets.sum(dim=2, keepdim=True), rtol=1e-4, atol=1e-4 * spread)
 
 
 def test_what_untrained_critics_put_out_is_no_value():
-    value_scale = ValueScale()
+    value_scale = ValueScale(2)
     assert value_scale.values(th.randn(9, 1)).abs().max() < 1e-6
-    assert value_scale.update(1e4 * th.randn(64, 1)) == (1.0, 0.0)
+    assert value_scale.update(1e4 * th.randn(64, 2)) is None
 
 
 def test_a_first_reward_after_none_is_bounded():
-    value_scale = ValueScale()
+    value_scale = ValueScale(2)
     for _ in range(100):
-        value_scale.update(th.zeros(64, 1))
-    targets = th.zeros(64, 1)
+        value_scale.update(th.zeros(64, 2))
+    targets = th.zeros(64, 2)
     targets[0] = 1e5
     value_scale.update(targets)
     assert value_scale.outputs(targets).abs().max() <= MAX_OUTPUT
@@ -45,7 +47,7 @@ def test_values_stay_when_the_scale_changes(target):
     model = filled_model(HybridIdentityEnv())
     policy, data = model.policy, sample(model)
     critic = model.critic_target if target else model.critic
-    policy.in_units_of_critics(th.randn(32, 1))
+    policy.in_units_of_critics(th.randn(32, 2))
 
     def values():
         features = critic.features(data.observations)
@@ -56,7 +58,7 @@ def test_values_stay_when_the_scale_changes(target):
         outputs, scale = values()
         expected = policy.value_scale.values(outputs)
         for _ in range(20):
-            policy.in_units_of_critics(factor * th.randn(32, 1))
+            policy.in_units_of_critics(factor * th.randn(32, 2))
         outputs, new_scale = values()
         assert abs(np.log(new_scale / scale)) > 0.1
         th.testing.assert_close(policy.value_scale.values(outputs), expected, rtol=1e-4, atol=1e-4)

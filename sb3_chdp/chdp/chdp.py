@@ -2,7 +2,6 @@
 
 from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
@@ -12,13 +11,12 @@ from stable_baselines3.common.utils import LinearSchedule, update_learning_rate
 
 from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.critic import HybridCritic
-from sb3_chdp.chdp.exploration import ReturnSums, exploration_rate, informative_steps, vary_parts
+from sb3_chdp.chdp.exploring import ExploringAlgorithm
 from sb3_chdp.chdp.losses import continuous_policy_loss, critic_loss, discrete_policy_loss, relabel_latents, target_values
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_chdp.common.arguments import Accepted, number, of_networks, warn_of_cost, whole
 from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.hybrid_box import HybridBox
-from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.product_table import block_widths
 from sb3_chdp.common.samples import HybridReplaySamples
 from sb3_chdp.common.spaces import HybridActionSpec
@@ -28,7 +26,7 @@ from sb3_chdp.common.utils import TargetUpdate, gradient_step
 LEARNING_RATE = LinearSchedule(1e-3, 0.0, 1.0)
 
 
-class CHDP(HybridOffPolicyAlgorithm):
+class CHDP(ExploringAlgorithm):
     """
     Cooperative Hybrid Diffusion Policies (CHDP)
 
@@ -51,7 +49,9 @@ class CHDP(HybridOffPolicyAlgorithm):
            stored ones, and the continuous policy for uniformly random discrete actions too;
         6. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate`,
            :func:`informative_steps` and :func:`vary_parts`;
-        7. the learning rate falls linearly to 0.
+        7. critics tell rewards and what follows them apart, and what follows counts less in the choice of actions where
+           exploratory actions have shown no influence on it, see :class:`ForesightSums`;
+        8. the learning rate falls linearly to 0.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str), with a hybrid action space
@@ -178,10 +178,6 @@ class CHDP(HybridOffPolicyAlgorithm):
         self.codebook_lr_factor = codebook_lr_factor
         self.n_action_candidates = n_action_candidates
         self.policy_delay = policy_delay
-        # What the exploration rate depends on; returns_so_far are those of unfinished episodes, one per environment
-        self.n_informative_steps = 0.0
-        self.returns_so_far: list[float] = []
-        self.return_sums = ReturnSums()
 
         if _init_setup_model:
             self._setup_model()
@@ -228,16 +224,17 @@ class CHDP(HybridOffPolicyAlgorithm):
             targets = policy.in_units_of_critics(target_values(policy, replay_data))
             features = policy.critic.features(replay_data.observations)
             self.update_targets.copy_statistics()
-            loss, q_values, errors = critic_loss(policy, replay_data, features, targets)
+            loss, q_parts, errors = critic_loss(policy, replay_data, features, targets)
             gradient_step(loss, critic_optimizers, self.max_grad_norm, "critic_loss")
             policy.actor.codebook.project()
             if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
                 assert replay_data.indices is not None, "a prioritised buffer says where its samples are"
                 self.replay_buffer.update_priorities(replay_data.indices, errors)
-            losses = {"critic_loss": loss, "q_mean": policy.value_scale.values(q_values).mean(), "latent_drift": drift}
+            q_mean = policy.value_scale.values(q_parts.sum(dim=1, keepdim=True)).mean()
+            losses = {"critic_loss": loss, "q_mean": q_mean, "latent_drift": drift}
 
             if self._n_updates % self.policy_delay == 0:
-                alpha = self.eta / q_values.abs().mean().clamp(min=1e-6)
+                alpha = self.eta / (q_parts @ policy.critic.part_weights).abs().mean().clamp(min=1e-6)
                 features = features.detach()
 
                 # Step 1: discrete policy, eq. 7
@@ -301,29 +298,6 @@ class CHDP(HybridOffPolicyAlgorithm):
                 uniform_latents, uniform_k, _ = self.actor.random_actions(n_uniform)
                 latents, k = th.cat([uniform_latents, latents]), th.cat([uniform_k, k])
         return latents, k
-
-    def _exploration_rate(self) -> float:
-        n_values = sum(self.hybrid_space.spec.radices)
-        return exploration_rate(self.num_timesteps, self.n_informative_steps, self._episode_num, n_values)
-
-    def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any, **kwargs: Any) -> None:
-        super()._store_transition(replay_buffer, *args, **kwargs)
-        # As the environment gave them, within VecNormalize too
-        latest = replay_buffer.pos - 1
-        rewards, dones = replay_buffer.rewards[latest].tolist(), replay_buffer.dones[latest]
-        if len(self.returns_so_far) != self.n_envs:
-            self.returns_so_far = [0.0] * self.n_envs
-        self.returns_so_far = [value + reward for value, reward in zip(self.returns_so_far, rewards, strict=True)]
-        returns = ReturnSums(*self.return_sums)  # a list in a loaded model
-        for i in np.flatnonzero(dones):
-            returns = returns.add(self.returns_so_far[i])
-            self.returns_so_far[i] = 0.0
-        self.return_sums = returns
-        self.n_informative_steps += informative_steps(self.n_envs, returns)
-
-    def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator, masks: np.ndarray | None = None) -> np.ndarray:
-        assert self._last_obs is not None, "self._last_obs was not set"
-        return vary_parts(self.policy, self._last_obs, rows, rng, masks)
 
     def _update_learning_rates(self) -> None:
         """Set the learning rates of all optimizers according to their schedules."""

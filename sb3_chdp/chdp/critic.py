@@ -41,17 +41,19 @@ class AttentionReads(nn.Module):
 
 
 def value_mlp(n_inputs: int, net_arch: list[int], activation_fn: type[nn.Module]) -> nn.Sequential:
-    """:return: MLP with one output, and layer normalisation before the activation of its last hidden layer"""
+    """:return: MLP with two outputs, and layer normalisation before the activation of its last hidden layer"""
     layers = create_mlp(n_inputs, -1, net_arch, activation_fn)
     if net_arch:
         layers.insert(-1, nn.LayerNorm(net_arch[-1]))
-    return nn.Sequential(*layers, nn.Linear([n_inputs, *net_arch][-1], 1))
+    return nn.Sequential(*layers, nn.Linear([n_inputs, *net_arch][-1], 2))
 
 
 class QNetwork(nn.Module):
     """
-    Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a. The last hidden layers are normalised, which bounds Q
-    where there is no data (Ball et al., 2023), not the ones before, which would lose how large their inputs are.
+    Both parts of Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a: the reward, and what follows.
+
+    The last hidden layers are normalised, which bounds Q where there is no data (Ball et al., 2023), not the ones before,
+    which would lose how large their inputs are.
 
     A sees what the latent reads of the features, see :class:`AttentionReads`, and the products of all its entries with all
     parameters: what a parameter does depends on the discrete action, often by a factor. V and A are not told apart
@@ -82,33 +84,37 @@ class QNetwork(nn.Module):
         self.advantage = value_mlp(n_inputs, net_arch, activation_fn)
 
     def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-        """:return: (B, 1) values"""
+        """:return: (B, 2) expected rewards and discounted values of what follows"""
         products = (latents[:, :, None] * parameters[:, None]).flatten(1)
         x = th.cat([features, parameters, latents, self.reads(features, latents), products], dim=1)
         return self.value(features) + self.advantage(x)
 
     @th.no_grad()
-    def rescale(self, factor: float, summand: float) -> None:
-        """Multiply the values by a factor and add a number."""
+    def rescale(self, factor: th.Tensor, summands: th.Tensor) -> None:
+        """Multiply the values by a factor and add a number to each part."""
         for parameter in (*self.value[-1].parameters(), *self.advantage[-1].parameters()):
             parameter.mul_(factor)
         *_, bias = self.value[-1].parameters()
-        bias.add_(summand)
+        bias.add_(summands)
 
 
 class HybridCritic(BaseModel):
     """
     Twin critic Q(s, latent, parameters), with the features of the state computed once for several calls.
 
+    Q is a sum of parts. With two of them, the reward and what follows, the second has a weight in the choice of actions.
+
     :param observation_space: observation space
     :param action_space: space of the action rows
     :param features_extractor: network to extract features
-    :param q_networks: two networks of features, latents and parameters
+    :param q_networks: two networks of features, latents and parameters, which put out the parts of Q
+    :param n_parts: number of parts
     :param normalize_images: whether to divide images by 255
     """
 
     features_extractor: BaseFeaturesExtractor
     optimizer: th.optim.Optimizer
+    part_weights: th.Tensor
 
     def __init__(
         self,
@@ -116,33 +122,41 @@ class HybridCritic(BaseModel):
         action_space: spaces.Box,
         features_extractor: BaseFeaturesExtractor,
         q_networks: list[nn.Module],
+        n_parts: int,
         normalize_images: bool = True,
     ):
         super().__init__(
             observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
         )
         self.q_networks = nn.ModuleList(q_networks)
+        self.register_buffer("part_weights", th.ones(n_parts, 1))
 
     def features(self, obs: PyTorchObs) -> th.Tensor:
         """:return: (B, features_dim) features of the observations"""
         return self.extract_features(obs, self.features_extractor)
 
-    def q_values(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def parts(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> list[th.Tensor]:
         """
         :param features: (B, features_dim) from :meth:`features`
         :param latents: (B, latent_dim)
         :param parameters: (B, n_parameters) scaled parameters
-        :return: Q1 and Q2, each (B, 1), in the units of :class:`ValueScale`
+        :return: parts of Q1 and of Q2, each (B, n_parts), in the units of :class:`ValueScale`
         """
-        q1, q2 = (q_net(features, latents, parameters) for q_net in self.q_networks)
+        return [q_net(features, latents, parameters) for q_net in self.q_networks]
+
+    def q_values(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        :return: what decides between actions: weighted sums of the parts of Q1 and of Q2, each (B, 1); see :meth:`parts`
+        """
+        q1, q2 = (parts @ self.part_weights for parts in self.parts(features, latents, parameters))
         return q1, q2
 
     def q1_values(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
         """:return: (B, 1) Q1 alone, see :meth:`q_values`"""
-        return self.q_networks[0](features, latents, parameters)
+        return self.q_networks[0](features, latents, parameters) @ self.part_weights
 
-    def rescale(self, factor: float, summand: float) -> None:
-        """Multiply the values by a factor and add a number."""
+    def rescale(self, factor: th.Tensor, summands: th.Tensor) -> None:
+        """Multiply the values by a factor and add a number to each part."""
         for q_net in self.q_networks:
             assert isinstance(q_net, QNetwork)
-            q_net.rescale(factor, summand)
+            q_net.rescale(factor, summands)

@@ -99,7 +99,7 @@ def random_parameters(rng: np.random.Generator, mask: np.ndarray) -> np.ndarray:
 
 def vary_parts(
     policy: CHDPPolicy,
-    observation: np.ndarray | dict[str, np.ndarray],
+    features: th.Tensor,
     rows: np.ndarray,
     rng: np.random.Generator,
     masks: np.ndarray | None = None,
@@ -114,7 +114,7 @@ def vary_parts(
     Random parameters are those of :func:`random_parameters`.
 
     :param policy: the policies
-    :param observation: n observations
+    :param features: (n, features_dim) features of the observations
     :param rows: (n, columns) the policy's actions
     :param rng: random generator
     :param masks: (n, K) False for discrete actions that may not be taken, None if all may
@@ -126,7 +126,6 @@ def vary_parts(
     random = policy.random_rows(rng, n, masks)
     of_random_k = random.copy()
     with th.no_grad():
-        features = policy.critic_target.features(policy.obs_to_tensor(observation)[0])
         k = th.as_tensor(columns.discrete_actions(random), device=policy.device)
         columns.view(of_random_k, "parameters")[:] = policy.actor.sample_parameters(features, k).cpu().numpy()
 

@@ -1,6 +1,7 @@
 """The losses of CHDP, one function for each of the paper's equations, and the relabelling of stored latents."""
 
 import torch as th
+from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.samples import HybridReplaySamples
@@ -22,43 +23,58 @@ def relabel_latents(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> tup
 
 
 @th.no_grad()
+def next_values(policy: CHDPPolicy, observations: PyTorchObs, masks: th.Tensor | None = None) -> th.Tensor:
+    """
+    min_j Q'_j(s', e', a') of the best action (e', a') among a few of the target policies.
+
+    The online critics choose and the targets value, so that an error has to be in both to raise the value (double Q-learning,
+    van Hasselt et al., 2016).
+
+    :param policy: the networks
+    :param observations: (B, ...) next observations
+    :param masks: (B, K) False for discrete actions that may not be taken, None if all may
+    :return: (B, 1) values in the units of the rewards, with all that follows
+    """
+    features = policy.critic_target.features(observations)
+    latents, _, parameters = policy.select_target(policy.actor_target, policy.critic, features, masks=masks)
+    q1, q2 = (parts.sum(dim=1, keepdim=True) for parts in policy.critic_target.parts(features, latents, parameters))
+    return policy.value_scale.values(th.min(q1, q2))
+
+
+@th.no_grad()
 def target_values(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> th.Tensor:
     """
-    Eq. 11, y = r + gamma min_j Q'_j(s', e', a') of the best next action (e', a') among a few of the target policies.
-
-    The online critics choose and the targets value, so that an error has to be in both to raise y (double Q-learning, van
-    Hasselt et al., 2016).
+    Both parts of eq. 11, y = r + gamma min_j Q'_j(s', e', a'), see :func:`next_values`.
 
     :param policy: the networks
     :param replay_data: a batch
-    :return: (B, 1) y in the units of the rewards
+    :return: (B, 2) rewards and what follows them, in the units of the rewards
     """
-    features = policy.critic_target.features(replay_data.next_observations)
-    latents, _, parameters = policy.select_target(policy.actor_target, policy.critic, features, masks=replay_data.next_masks)
-    next_q_values = th.min(*policy.critic_target.q_values(features, latents, parameters))
-    next_values = policy.value_scale.values(next_q_values)
-    return replay_data.rewards + (1 - replay_data.dones) * replay_data.discounts * next_values
+    values = next_values(policy, replay_data.next_observations, replay_data.next_masks)
+    return th.cat([replay_data.rewards, (1 - replay_data.dones) * replay_data.discounts * values], dim=1)
 
 
 def critic_loss(
     policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, targets: th.Tensor
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """
-    Eq. 10, (Q_j(s, e, a) - y)^2, weighted if the replay is prioritised. It has a gradient for the codebook, which may be used.
+    Eq. 10, (Q_j(s, e, a) - y)^2, for each part of Q, weighted if the replay is prioritised.
+
+    It has a gradient for the codebook, which may be used.
 
     :param policy: the networks
     :param replay_data: a batch
     :param features: (B, features_dim) features of the observations
-    :param targets: (B, 1) targets y in the units of the critics
-    :return: sum over both critics, the detached (B, 1) values of the first, and the larger (B,) absolute error of both
+    :param targets: (B, n_parts) targets y in the units of the critics
+    :return: sum over both critics, the detached (B, n_parts) parts of the first, and the larger (B,) absolute error of both
     """
     # The gradient with respect to a latent is also that of its codeword, as if the one moved with the other
     codewords = policy.actor.codebook(replay_data.discrete_actions)
     latents = replay_data.latents + (codewords - codewords.detach())
-    q1, q2 = policy.critic.q_values(features, latents, replay_data.parameters)
-    errors = th.cat([q1, q2], dim=1) - targets
-    loss = (replay_data.weights * errors.square()).sum(dim=1).mean()
-    return loss, q1.detach(), errors.detach().abs().amax(dim=1)
+    parts = th.stack(policy.critic.parts(features, latents, replay_data.parameters), dim=1)
+    errors = parts - targets[:, None]
+    loss = (replay_data.weights * errors.square().sum(dim=2)).sum(dim=1).mean()
+    return loss, parts[:, 0].detach(), errors.detach().sum(dim=2).abs().amax(dim=1)
 
 
 def discrete_policy_loss(

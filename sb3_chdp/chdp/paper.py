@@ -31,7 +31,7 @@ class PaperQNetwork(nn.Module):
         self.mlp = nn.Sequential(*create_mlp(n_inputs, 1, net_arch, activation_fn))
 
     def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-        """:return: (B, 1) values"""
+        """:return: (B, 1) values, in one part"""
         return self.mlp(th.cat([features, latents, parameters], dim=1))
 
 
@@ -53,7 +53,10 @@ class PaperPolicy(CHDPPolicy):
         n_inputs = extractor.features_dim + self.action_space.latent_dim + self.action_space.spec.max_parameters
         critic_arch = get_actor_critic_arch(self.net_arch)[1]
         q_networks: list[nn.Module] = [PaperQNetwork(n_inputs, critic_arch, self.activation_fn) for _ in range(2)]
-        return HybridCritic(self.observation_space, self.action_space, extractor, q_networks, self.normalize_images)
+        return HybridCritic(self.observation_space, self.action_space, extractor, q_networks, 1, self.normalize_images)
+
+    def in_units_of_critics(self, targets: th.Tensor) -> th.Tensor:
+        return targets.sum(dim=1, keepdim=True)
 
     def _make_selections(self) -> tuple[Selection, Selection, Selection]:
         one = Selection(n_drawn=1)

@@ -109,7 +109,7 @@ class CHDPPolicy(HybridPolicy):
         for target in (self.actor_target, self.critic_target):
             target.requires_grad_(False)
             target.train(False)
-        self.value_scale = ValueScale(self.adapts_values)
+        self.value_scale = ValueScale(len(self.critic.part_weights), self.adapts_values)
         self.select, self.select_deterministic, self.select_target = self._make_selections()
 
         actor = self.actor
@@ -132,7 +132,7 @@ class CHDPPolicy(HybridPolicy):
             QNetwork(extractor.features_dim, latent_dim, n_parameters, critic_arch, self.activation_fn, self.n_reads)
             for _ in range(2)
         ]
-        return HybridCritic(self.observation_space, self.action_space, extractor, q_networks, self.normalize_images)
+        return HybridCritic(self.observation_space, self.action_space, extractor, q_networks, 2, self.normalize_images)
 
     def _make_actor(self, features_dim: int) -> CooperativeActor:
         spec, latent_dim = self.action_space.spec, self.action_space.latent_dim
@@ -228,14 +228,20 @@ class CHDPPolicy(HybridPolicy):
         """
         Adapt the units of the critics to new targets; values stay what they were.
 
-        :param targets: (B, 1) targets in the units of the rewards
-        :return: (B, 1) what the critics ought to put out
+        :param targets: (B, 2) rewards and what follows them, in the units of the rewards
+        :return: (B, n_parts) what the critics ought to put out
         """
-        if self.value_scale.adapts:
-            factor, summand = self.value_scale.update(targets)
+        if self.value_scale.adapts and (change := self.value_scale.update(targets)) is not None:
             for critic in (self.critic, self.critic_target):
-                critic.rescale(factor, summand)
+                critic.rescale(*change)
         return self.value_scale.outputs(targets)
+
+    def set_foresight(self, weight: float) -> None:
+        """
+        :param weight: weight in [0, 1] of what follows a reward in the choice of actions, see :class:`ForesightSums`
+        """
+        for critic in (self.critic, self.critic_target):
+            critic.part_weights[1:] = weight
 
     def set_training_mode(self, mode: bool) -> None:
         """

@@ -12,10 +12,11 @@ MAX_OUTPUT = 20.0
 
 class ValueScale(nn.Module):
     """
-    Values are ``center + scale * output`` of the critics: mean and standard deviation of the targets so far. When these
-    change, the critics' last layers do as well, so that values stay (PopArt, van Hasselt et al., 2016). At first all values
-    are 0, whatever the critics put out.
+    A part of a value is ``center + scale * output`` of the critics: mean of its targets so far, and the standard deviation of
+    the sum of all parts. When these change, the critics' last layers do as well, so that values stay (PopArt, van Hasselt et
+    al., 2016). At first all values are 0, whatever the critics put out.
 
+    :param n_parts: number of parts of a value
     :param adapts: False: values are what the critics put out, for ever
     """
 
@@ -23,11 +24,11 @@ class ValueScale(nn.Module):
     variance: th.Tensor
     n_batches: th.Tensor
 
-    def __init__(self, adapts: bool = True) -> None:
+    def __init__(self, n_parts: int, adapts: bool = True) -> None:
         super().__init__()
         self.adapts = adapts
-        for name in ("center", "variance", "n_batches"):
-            self.register_buffer(name, th.zeros((), dtype=th.float64))
+        for name, shape in (("center", (n_parts,)), ("variance", ()), ("n_batches", ())):
+            self.register_buffer(name, th.zeros(shape, dtype=th.float64))
         self.variance += not adapts
 
     @property
@@ -36,29 +37,36 @@ class ValueScale(nn.Module):
         return self.variance.sqrt().clamp(min=MIN_SCALE)
 
     def values(self, outputs: th.Tensor) -> th.Tensor:
-        """:return: values in the units of the rewards"""
-        return (self.center + self.scale * outputs.double()).float()
+        """
+        :param outputs: (B, 1) sums of the parts that the critics put out
+        :return: (B, 1) values in the units of the rewards
+        """
+        return (self.center.sum() + self.scale * outputs.double()).float()
 
-    def outputs(self, values: th.Tensor) -> th.Tensor:
-        """:return: what critics put out for the values, at most ``MAX_OUTPUT`` from 0 if the scale adapts"""
-        outputs = ((values.double() - self.center) / self.scale).float()
+    def outputs(self, parts: th.Tensor) -> th.Tensor:
+        """
+        :param parts: (B, n_parts) parts of values, in the units of the rewards
+        :return: (B, n_parts) what critics put out for them, at most ``MAX_OUTPUT`` from 0 if the scale adapts
+        """
+        outputs = ((parts.double() - self.center) / self.scale).float()
         return outputs.clamp(-MAX_OUTPUT, MAX_OUTPUT) if self.adapts else outputs
 
     @th.no_grad()
-    def update(self, targets: th.Tensor) -> tuple[float, float]:
+    def update(self, targets: th.Tensor) -> tuple[th.Tensor, th.Tensor] | None:
         """
-        :param targets: (B, 1) targets of the critics, in the units of the rewards
-        :return: factor and summand for the critics' outputs, so that the values stay what they were
+        :param targets: (B, n_parts) targets of the critics, in the units of the rewards
+        :return: () factor and (n_parts,) summands for the critics' outputs, so that the values stay what they were, None if
+            nothing is to change
         """
         center, scale = self.center.clone(), self.scale
         if not th.isfinite(targets).all():
-            return 1.0, 0.0  # the loss will be refused, and nothing is to have changed
+            return None  # the loss will be refused, and nothing is to have changed
         self.n_batches += 1
         weight = (1 / self.n_batches).clamp(min=MIN_UPDATE_WEIGHT)
-        shift = targets.double().mean() - center
-        variance = targets.double().var(correction=0)
-        self.variance.lerp_(variance + (1 - weight) * shift.square(), weight)
+        shift = targets.double().mean(dim=0) - center
+        variance = targets.double().sum(dim=1).var(correction=0)
+        self.variance.lerp_(variance + (1 - weight) * shift.sum().square(), weight)
         self.center += weight * shift
         if scale <= MIN_SCALE:
-            return 1.0, 0.0
-        return float(scale / self.scale), float((center - self.center) / self.scale)
+            return None
+        return (scale / self.scale).float(), ((center - self.center) / self.scale).float()

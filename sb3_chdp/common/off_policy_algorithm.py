@@ -251,21 +251,24 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         else:
             rows = self.policy.noisy_rows(obs, noise, masks)
         if explores.any():
-            rows[explores] = self._exploratory_rows(rows, rng, **of_random)[explores]
+            rows[explores] = self._exploratory_rows(rows, np.flatnonzero(explores), rng, masks)
         return rows
 
     def _exploration_rate(self) -> float:
         """:return: probability that exploration takes the place of the policy"""
         return 0.0
 
-    def _exploratory_rows(self, rows: np.ndarray, rng: np.random.Generator, masks: np.ndarray | None = None) -> np.ndarray:
+    def _exploratory_rows(
+        self, rows: np.ndarray, envs: np.ndarray, rng: np.random.Generator, masks: np.ndarray | None
+    ) -> np.ndarray:
         """
-        :param rows: (n, columns) what the policy would do
+        :param rows: (n_envs, columns) what the policy would do
+        :param envs: (n,) indices of the environments that explore
         :param rng: random generator
-        :param masks: (n, K) False for discrete actions that may not be taken; not given if there are none
-        :return: (n, columns) what exploration does instead: uniformly random actions
+        :param masks: (n_envs, K) False for discrete actions that may not be taken, None if all may
+        :return: (n, columns) what they do instead: uniformly random actions
         """
-        return self.policy.random_rows(rng, len(rows), **({} if masks is None else {"masks": masks}))
+        return self.policy.random_rows(rng, len(envs), **({} if masks is None else {"masks": masks[envs]}))
 
     def _store_transition(
         self,

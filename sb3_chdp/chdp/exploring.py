@@ -1,0 +1,101 @@
+"""What CHDP does to explore, and what it learns about itself from that."""
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+
+from sb3_chdp.chdp.exploration import ReturnSums, exploration_rate, informative_steps
+from sb3_chdp.chdp.foresight import Claims, ForesightSums, explore
+from sb3_chdp.chdp.losses import next_values
+from sb3_chdp.chdp.policies import CHDPPolicy
+from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
+
+# Claims of critics that have hardly learnt are no matter
+MIN_UPDATES = 200
+
+
+class ExploringAlgorithm(HybridOffPolicyAlgorithm):
+    """
+    Exploration at a rate that follows from the task, see :func:`exploration_rate`, and foresight as far as exploratory actions
+    justify it, see :class:`ForesightSums`.
+
+    :param args: those of :class:`HybridOffPolicyAlgorithm`
+    :param kwargs: those of :class:`HybridOffPolicyAlgorithm`
+    """
+
+    policy: CHDPPolicy
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        # What the exploration rate depends on; returns_so_far are those of unfinished episodes, one per environment
+        self.n_informative_steps = 0.0
+        self.returns_so_far: list[float] = []
+        self.return_sums = ReturnSums()
+        self.foresight_sums = ForesightSums()
+        # Those of the present step
+        self._claims: Claims | None = None
+
+    def _exploration_rate(self) -> float:
+        n_values = sum(self.hybrid_space.spec.radices)
+        return exploration_rate(self.num_timesteps, self.n_informative_steps, self._episode_num, n_values)
+
+    def _exploratory_rows(
+        self, rows: np.ndarray, envs: np.ndarray, rng: np.random.Generator, masks: np.ndarray | None
+    ) -> np.ndarray:
+        assert self._last_obs is not None, "self._last_obs was not set"
+        observation = self.policy.obs_to_tensor(self._last_obs)[0]
+        self._claims = explore(self.policy, observation, rows[envs], envs, rng, None if masks is None else masks[envs])
+        return self._claims.rows
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: Any,
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self._count_returns(replay_buffer)
+        if self._claims is not None and self._n_updates >= MIN_UPDATES and self.n_steps == 1:
+            self._check_claims(self._claims, new_obs, dones, infos)
+        self._claims = None
+
+    def _count_returns(self, replay_buffer: ReplayBuffer) -> None:
+        # As the environment gave them, within VecNormalize too
+        latest = replay_buffer.pos - 1
+        rewards, dones = replay_buffer.rewards[latest].tolist(), replay_buffer.dones[latest]
+        if len(self.returns_so_far) != self.n_envs:
+            self.returns_so_far = [0.0] * self.n_envs
+        self.returns_so_far = [value + reward for value, reward in zip(self.returns_so_far, rewards, strict=True)]
+        returns = ReturnSums(*self.return_sums)  # a list in a loaded model
+        for i in np.flatnonzero(dones):
+            returns = returns.add(self.returns_so_far[i])
+            self.returns_so_far[i] = 0.0
+        self.return_sums = returns
+        self.n_informative_steps += informative_steps(self.n_envs, returns)
+
+    def _check_claims(self, claims: Claims, new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """Compare what was claimed to follow exploratory actions with the values of what did."""
+        masks = self._action_masks()
+        next_masks = None if masks is None else th.as_tensor(masks, device=self.device)
+        values = next_values(self.policy, self.policy.obs_to_tensor(new_obs)[0], next_masks)
+        values = self.gamma * values * th.as_tensor(1.0 - dones, dtype=th.float32, device=self.device)[:, None]
+        followed = self.policy.value_scale.outputs(th.cat([th.zeros_like(values), values], dim=1))[:, 1].tolist()
+        sums = ForesightSums(*self.foresight_sums)  # a list in a loaded model
+        for i, advantage, expected in zip(claims.envs, claims.advantages, claims.expected, strict=True):
+            # A new episode has begun where a time limit was reached: its first state is not what followed
+            if not infos[i].get("TimeLimit.truncated", False):
+                sums = sums.add(float(advantage), followed[i] - float(expected))
+        self.foresight_sums = sums
+        self.policy.set_foresight(sums.weight())
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_claims"]
+
+    def _on_step(self) -> None:
+        super()._on_step()
+        self.logger.record("rollout/foresight", ForesightSums(*self.foresight_sums).weight())

@@ -1,0 +1,147 @@
+"""Whether what follows a reward counts in the choice of actions."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import CheckpointCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_chdp import CHDP
+from sb3_chdp.chdp import PaperCHDP, exploring
+from sb3_chdp.chdp.foresight import MIN_CLAIMS, Claims, ForesightSums, explore, what_follows
+from tests.algorithms import fast_model, filled_model, sample
+from tests.hybrid_envs import MaskedEnv, box, make_layout_env
+
+
+def weight(slope, noise, n=2000):
+    rng, sums = np.random.default_rng(0), ForesightSums()
+    for x in rng.normal(size=n):
+        sums = sums.add(x, slope * x + noise * rng.normal())
+    return sums.weight()
+
+
+def test_the_weight_is_what_comes_true_of_claims():
+    assert weight(slope=1.0, noise=0.5) == weight(slope=0.6, noise=0.5) == 1
+    assert weight(slope=0.25, noise=0.01) == pytest.approx(0.5, abs=0.01)
+    assert weight(slope=0.0, noise=1.0) < 0.3
+    assert weight(slope=-0.5, noise=1.0) == 0
+
+
+def test_the_benefit_of_the_doubt():
+    assert weight(slope=-1.0, noise=0.1, n=MIN_CLAIMS - 1) == 1
+    assert weight(slope=0.0, noise=100.0) == 1
+    assert ForesightSums(n=100.0, yy=1.0).weight() == 1, "nothing was claimed"
+
+
+def test_old_claims_fade():
+    sums = ForesightSums()
+    for slope in (0.0, 1.0):
+        for x in np.random.default_rng(0).normal(size=3000):
+            sums = sums.add(x, slope * x)
+    assert sums.weight() == 1 and sums.n < 501
+
+
+def test_claims_are_what_the_critics_say():
+    """Of the rows that are taken, compared with others of the same observation; their mean is 0."""
+    model = filled_model(make_layout_env("nested"))
+    obs = th.rand(300, 2) * 2 - 1
+    envs = np.arange(0, 300, 2)
+    rows = model.policy.predict_rows(obs.numpy())[envs]
+    claims = explore(model.policy, obs, rows, envs, np.random.default_rng(0))
+    assert claims.rows.shape == rows.shape and (claims.envs == envs).all()
+    with th.no_grad():
+        said = what_follows(model.policy, model.critic_target.features(obs)[envs], claims.rows).numpy()
+    means = said - claims.advantages
+    # Two estimates of the same means
+    assert np.corrcoef(means, claims.expected)[0, 1] > 0.5 and np.abs(means - claims.expected).max() > 1e-6
+    assert abs(claims.advantages.mean()) < 3 * claims.advantages.std() / np.sqrt(150)
+
+
+@pytest.mark.parametrize("foresight", [0.0, 0.5, 1.0])
+def test_what_decides_between_actions(foresight):
+    model = filled_model()
+    data, policy = sample(model), model.policy
+    policy.set_foresight(foresight)
+    for critic in (model.critic, model.critic_target):
+        features = critic.features(data.observations)
+        inputs = (features, data.latents, data.parameters)
+        expected = [parts[:, :1] + foresight * parts[:, 1:] for parts in critic.parts(*inputs)]
+        th.testing.assert_close(list(critic.q_values(*inputs)), expected)
+        th.testing.assert_close(critic.q1_values(*inputs), expected[0])
+
+
+class Pairs(gym.Env):
+    """
+    Each of 20 steps is worth how near the parameter is to the first entry of the observation, and has a bonus, which is the
+    second one: ``random`` and the same for all actions, or the discrete action of the step before.
+    """
+
+    def __init__(self, random):
+        self.random = random
+        self.observation_space, self.action_space = box(-1, 1, 2), spaces.Tuple((spaces.Discrete(2), box(-1, 1, 1)))
+
+    def _observe(self, k):
+        bonus = self.np_random.integers(2) if self.random else k
+        self.obs = np.array([self.np_random.uniform(-1, 1), bonus], dtype=np.float32)
+        return self.obs
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.n_steps = 0
+        return self._observe(0), {}
+
+    def step(self, action):
+        self.n_steps += 1
+        reward = float(3 * self.obs[1] - abs(action[1][0] - self.obs[0]))
+        return self._observe(int(action[0])), reward, False, self.n_steps == 20, {}
+
+
+def test_claims_come_true_where_actions_have_influence():
+    sums = []
+    for random in (True, False):
+        model = fast_model(env=Pairs(random), learning_starts=100, gamma=0.9, train_freq=2, batch_size=64).learn(800)
+        sums.append(model.foresight_sums)
+        for critic in (model.critic, model.critic_target):
+            assert critic.part_weights[1].item() == pytest.approx(model.foresight_sums.weight())
+    assert sums[1].xy / sums[1].xx > 0.5 and sums[1].weight() == 1
+    assert abs(sums[0].xy) < 0.2 * sums[1].xy
+
+
+def test_it_is_saved(tmp_path):
+    model = fast_model(env=Pairs(False))
+    model.policy.set_foresight(0.25)
+    model.foresight_sums = ForesightSums(50.0, 1.0, 0.5, 2.0)
+    # Saves between an exploratory action and what follows it
+    model.learn(30, CheckpointCallback(10, str(tmp_path)))
+    model.save(tmp_path / "model")
+    loaded = CHDP.load(tmp_path / "model", env=Pairs(False))
+    assert ForesightSums(*loaded.foresight_sums) == model.foresight_sums
+    assert loaded.critic.part_weights[1] == loaded.critic_target.part_weights[1] == model.critic.part_weights[1]
+    loaded.learn(30, reset_num_timesteps=False)
+
+
+def test_ends_of_episodes(monkeypatch):
+    """Nothing follows a terminal state; what follows a time limit is not known, as the next episode has begun."""
+    model = filled_model(DummyVecEnv([lambda: make_layout_env("nested")] * 3))
+    monkeypatch.setattr(exploring, "next_values", lambda policy, observation, masks: th.full((3, 1), 7.0))
+    model.policy.value_scale.variance += 4 - model.policy.value_scale.variance
+    model.policy.value_scale.center[1] = 2.0
+    claims = Claims(None, np.arange(3), np.array([1.0, 10.0, 100.0]), np.array([0.5, 0.5, 0.5]))
+    infos = [{}, {}, {"TimeLimit.truncated": True}]
+    model._check_claims(claims, model._last_obs, np.array([False, True, True]), infos)
+    goes_on, ends = (7.0 * model.gamma - 2) / 2 - 0.5, (0 - 2) / 2 - 0.5
+    assert model.foresight_sums.xy == pytest.approx(goes_on + 10 * ends, rel=0.01)
+
+
+def test_masks_and_several_environments():
+    model = fast_model(env=DummyVecEnv([MaskedEnv] * 3), learning_starts=10, gradient_steps=4)
+    model.learn(300)
+    assert ForesightSums(*model.foresight_sums).n > MIN_CLAIMS
+
+
+def test_the_paper_looks_ahead():
+    model = fast_model(PaperCHDP, learning_starts=10)
+    model.learn(40)
+    assert model.critic.part_weights.tolist() == [[1.0]] and model.foresight_sums == ForesightSums()
