@@ -162,6 +162,7 @@ def test_next_values_are_whole_without_foresight():
     """Foresight matters for the choice of the next action, not for what it is worth."""
     model = filled_model()
     data, policy = sample(model), model.policy
+    policy.in_units_of_critics(th.randn(32, 2))
     policy.set_foresight(0.0)
     features = model.critic_target.features(data.next_observations)
     th.manual_seed(0)
