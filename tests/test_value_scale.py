@@ -26,6 +26,14 @@ def test_outputs_have_zero_mean_and_unit_variance(spread):
     th.testing.assert_close(value_scale.values(total), targets.sum(dim=2, keepdim=True), rtol=1e-4, atol=1e-4 * spread)
 
 
+def test_parts_that_cancel_are_of_unit_size_too():
+    value_scale, rewards = ValueScale(2), th.randn(600, 64, 1)
+    targets = 5 * th.cat([rewards, 0.01 * th.randn(600, 64, 1) - rewards], dim=2)
+    for batch in targets:
+        value_scale.update(batch)
+    np.testing.assert_allclose(value_scale.outputs(targets).std(dim=(0, 1)), np.sqrt(0.5), rtol=0.05)
+
+
 def test_what_untrained_critics_put_out_is_no_value():
     value_scale = ValueScale(2)
     assert value_scale.values(th.randn(9, 1)).abs().max() < 1e-6

@@ -49,16 +49,9 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         self._claims = explore(self.policy, observation, rows[envs], envs, rng, None if masks is None else masks[envs])
         return self._claims.rows
 
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: Any,
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+    def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any) -> None:
+        super()._store_transition(replay_buffer, *args)
+        _, new_obs, _, dones, infos = args
         self._count_returns(replay_buffer)
         if self._claims is not None and self._n_updates >= MIN_UPDATES and self.n_steps == 1:
             self._check_claims(self._claims, new_obs, dones, infos)

@@ -12,9 +12,9 @@ MAX_OUTPUT = 20.0
 
 class ValueScale(nn.Module):
     """
-    A part of a value is ``center + scale * output`` of the critics: mean of its targets so far, and the standard deviation of
-    the sum of all parts. When these change, the critics' last layers do as well, so that values stay (PopArt, van Hasselt et
-    al., 2016). At first all values are 0, whatever the critics put out.
+    A part of a value is ``center + scale * output`` of the critics: mean of its targets so far, and the root of the sum of all
+    parts' variances. When these change, the critics' last layers do as well, so that values stay (PopArt, van Hasselt et al.,
+    2016). At first all values are 0, whatever the critics put out.
 
     :param n_parts: number of parts of a value
     :param adapts: False: values are what the critics put out, for ever
@@ -64,8 +64,9 @@ class ValueScale(nn.Module):
         self.n_batches += 1
         weight = (1 / self.n_batches).clamp(min=MIN_UPDATE_WEIGHT)
         shift = targets.double().mean(dim=0) - center
-        variance = targets.double().sum(dim=1).var(correction=0)
-        self.variance.lerp_(variance + (1 - weight) * shift.sum().square(), weight)
+        # Not of the sum: parts may cancel
+        variances = targets.double().var(dim=0, correction=0)
+        self.variance.lerp_((variances + (1 - weight) * shift.square()).sum(), weight)
         self.center += weight * shift
         if scale <= MIN_SCALE:
             return None
