@@ -268,7 +268,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         :param masks: (n_envs, K) False for discrete actions that may not be taken, None if all may
         :return: (n, columns) what they do instead: uniformly random actions
         """
-        return self.policy.random_rows(rng, len(envs), **({} if masks is None else {"masks": masks[envs]}))
+        return self.policy.random_rows(rng, len(rows), **({} if masks is None else {"masks": masks}))[envs]
 
     def _store_transition(
         self,
