@@ -29,7 +29,7 @@ from sb3_chdp.common.arguments import (
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox
 from sb3_chdp.common.rollout_buffers import HybridDictRolloutBuffer, HybridRolloutBuffer
-from sb3_chdp.common.utils import gradient_step
+from sb3_chdp.common.utils import NonFiniteLossError, gradient_step
 from sb3_chdp.hppo.policies import CnnPolicy, HPPOPolicy, MlpPolicy, MultiInputPolicy
 
 SelfHPPO = TypeVar("SelfHPPO", bound="HPPO")
@@ -235,6 +235,12 @@ class HPPO(HybridAlgorithm, PPO):
         self._update_learning_rate(self.policy.optimizer)
         clip_range = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]  # schedules by now
         clip_range_vf = self.clip_range_vf and self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
+
+        # One bad return lies in one minibatch: those before would move the policy
+        returns = self.rollout_buffer.returns
+        sum_of_squares = float(np.vdot(returns, returns))
+        if not np.isfinite(sum_of_squares):
+            raise NonFiniteLossError("value_loss", sum_of_squares)
 
         logs: dict[str, list[th.Tensor]] = {}
         for epoch in range(self.n_epochs):
