@@ -49,7 +49,7 @@ class CHDP(ExploringAlgorithm):
            stored ones, and the continuous policy for uniformly random discrete actions too;
         6. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate`,
            :func:`informative_steps` and :func:`vary_parts`;
-        7. critics tell rewards and what follows them apart, and what follows counts less in the choice of actions where
+        7. critics learn rewards beside values, and what follows a reward counts less in the choice of actions where
            exploratory actions have shown no influence on it, see :class:`ForesightSums`;
         8. the learning rate falls linearly to 0.
 
@@ -224,17 +224,17 @@ class CHDP(ExploringAlgorithm):
             targets = policy.in_units_of_critics(target_values(policy, replay_data))
             features = policy.critic.features(replay_data.observations)
             self.update_targets.copy_statistics()
-            loss, q_parts, errors = critic_loss(policy, replay_data, features, targets)
+            loss, outputs, errors = critic_loss(policy, replay_data, features, targets)
             gradient_step(loss, critic_optimizers, self.max_grad_norm, "critic_loss")
             policy.actor.codebook.project()
             if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
                 assert replay_data.indices is not None, "a prioritised buffer says where its samples are"
                 self.replay_buffer.update_priorities(replay_data.indices, errors)
-            q_mean = policy.value_scale.values(q_parts.sum(dim=1, keepdim=True)).mean()
+            q_mean = policy.value_scale.values(outputs[:, :1]).mean()
             losses = {"critic_loss": loss, "q_mean": q_mean, "latent_drift": drift}
 
             if self._n_updates % self.policy_delay == 0:
-                alpha = self.eta / (q_parts @ policy.critic.part_weights).abs().mean().clamp(min=1e-6)
+                alpha = self.eta / (outputs @ policy.critic.output_weights).abs().mean().clamp(min=1e-6)
                 features = features.detach()
 
                 # Step 1: discrete policy, eq. 7

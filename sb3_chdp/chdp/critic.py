@@ -50,7 +50,7 @@ def value_mlp(n_inputs: int, net_arch: list[int], activation_fn: type[nn.Module]
 
 class QNetwork(nn.Module):
     """
-    Both parts of Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a: the reward, and what follows.
+    Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a, and the reward of the step in the same form.
 
     The last hidden layers are normalised, which bounds Q where there is no data (Ball et al., 2023), not the ones before,
     which would lose how large their inputs are.
@@ -84,14 +84,14 @@ class QNetwork(nn.Module):
         self.advantage = value_mlp(n_inputs, net_arch, activation_fn)
 
     def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-        """:return: (B, 2) expected rewards and discounted values of what follows"""
+        """:return: (B, 2) values and expected rewards"""
         products = (latents[:, :, None] * parameters[:, None]).flatten(1)
         x = th.cat([features, parameters, latents, self.reads(features, latents), products], dim=1)
         return self.value(features) + self.advantage(x)
 
     @th.no_grad()
     def rescale(self, factor: th.Tensor, summands: th.Tensor) -> None:
-        """Multiply the values by a factor and add a number to each part."""
+        """Multiply the outputs by a factor and add a number to each."""
         for parameter in (*self.value[-1].parameters(), *self.advantage[-1].parameters()):
             parameter.mul_(factor)
         *_, bias = self.value[-1].parameters()
@@ -102,19 +102,20 @@ class HybridCritic(BaseModel):
     """
     Twin critic Q(s, latent, parameters), with the features of the state computed once for several calls.
 
-    Q is a sum of parts. With two of them, the reward and what follows, the second has a weight in the choice of actions.
+    Its networks put out Q, and where there is a second output, the reward of the step: what decides between actions is then a
+    weighted mean of both.
 
     :param observation_space: observation space
     :param action_space: space of the action rows
     :param features_extractor: network to extract features
-    :param q_networks: two networks of features, latents and parameters, which put out the parts of Q
-    :param n_parts: number of parts
+    :param q_networks: two networks of features, latents and parameters
+    :param n_outputs: number of their outputs, 1 or 2
     :param normalize_images: whether to divide images by 255
     """
 
     features_extractor: BaseFeaturesExtractor
     optimizer: th.optim.Optimizer
-    part_weights: th.Tensor
+    output_weights: th.Tensor
 
     def __init__(
         self,
@@ -122,41 +123,41 @@ class HybridCritic(BaseModel):
         action_space: spaces.Box,
         features_extractor: BaseFeaturesExtractor,
         q_networks: list[nn.Module],
-        n_parts: int,
+        n_outputs: int,
         normalize_images: bool = True,
     ):
         super().__init__(
             observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
         )
         self.q_networks = nn.ModuleList(q_networks)
-        self.register_buffer("part_weights", th.ones(n_parts, 1))
+        self.register_buffer("output_weights", th.eye(n_outputs, 1))
 
     def features(self, obs: PyTorchObs) -> th.Tensor:
         """:return: (B, features_dim) features of the observations"""
         return self.extract_features(obs, self.features_extractor)
 
-    def parts(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> list[th.Tensor]:
+    def outputs(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> list[th.Tensor]:
         """
         :param features: (B, features_dim) from :meth:`features`
         :param latents: (B, latent_dim)
         :param parameters: (B, n_parameters) scaled parameters
-        :return: parts of Q1 and of Q2, each (B, n_parts), in the units of :class:`ValueScale`
+        :return: those of both networks, each (B, n_outputs), in the units of :class:`ValueScale`
         """
         return [q_net(features, latents, parameters) for q_net in self.q_networks]
 
     def q_values(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
-        :return: what decides between actions: weighted sums of the parts of Q1 and of Q2, each (B, 1); see :meth:`parts`
+        :return: what decides between actions, by either network, each (B, 1); see :meth:`outputs`
         """
-        q1, q2 = (parts @ self.part_weights for parts in self.parts(features, latents, parameters))
+        q1, q2 = (outputs @ self.output_weights for outputs in self.outputs(features, latents, parameters))
         return q1, q2
 
     def q1_values(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-        """:return: (B, 1) Q1 alone, see :meth:`q_values`"""
-        return self.q_networks[0](features, latents, parameters) @ self.part_weights
+        """:return: (B, 1) the first of :meth:`q_values` alone"""
+        return self.q_networks[0](features, latents, parameters) @ self.output_weights
 
     def rescale(self, factor: th.Tensor, summands: th.Tensor) -> None:
-        """Multiply the values by a factor and add a number to each part."""
+        """Multiply the outputs by a factor and add a number to each."""
         for q_net in self.q_networks:
             assert isinstance(q_net, QNetwork)
             q_net.rescale(factor, summands)

@@ -77,7 +77,9 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         next_masks = None if masks is None else th.as_tensor(masks, device=self.device)
         values = next_values(self.policy, self.policy.obs_to_tensor(new_obs)[0], next_masks)
         values = self.gamma * values * th.as_tensor(1.0 - dones, dtype=th.float32, device=self.device)[:, None]
-        followed = self.policy.value_scale.outputs(th.cat([th.zeros_like(values), values], dim=1))[:, 1].tolist()
+        # As the difference of the critics' outputs
+        center, scale = self.policy.value_scale.center, self.policy.value_scale.scale
+        followed = ((values[:, 0] - (center[0] - center[1])) / scale).tolist()
         sums = ForesightSums(*self.foresight_sums)  # a list in a loaded model
         for i, advantage, expected in zip(claims.envs, claims.advantages, claims.expected, strict=True):
             # A new episode has begun where a time limit was reached: its first state is not what followed

@@ -1,7 +1,7 @@
 """
 How far CHDP trusts what its critics say about the future: where actions have no influence on it, that is noise.
 
-The critics tell rewards and what follows them apart. Exploratory actions are random draws, so that only their effect tells
+The critics learn rewards beside values, which leaves what follows. Exploratory actions are random draws, so that only their effect tells
 what follows one from what follows others: what the critics claim of it can be compared with what did follow.
 """
 
@@ -76,7 +76,8 @@ def what_follows(policy: CHDPPolicy, features: th.Tensor, rows: np.ndarray) -> t
     """:return: (n,) discounted values that the target critics expect after actions, mean of both, in the critics' units"""
     columns, actions = policy.action_space.columns, th.as_tensor(rows, device=policy.device)
     latents, parameters = columns.view(actions, "latents"), columns.view(actions, "parameters")
-    return th.stack(policy.critic_target.parts(features, latents, parameters))[:, :, -1].mean(dim=0)
+    values, rewards = th.stack(policy.critic_target.outputs(features, latents, parameters)).mean(dim=0).unbind(dim=1)
+    return values - rewards
 
 
 @th.no_grad()

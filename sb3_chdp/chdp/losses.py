@@ -37,44 +37,46 @@ def next_values(policy: CHDPPolicy, observations: PyTorchObs, masks: th.Tensor |
     """
     features = policy.critic_target.features(observations)
     latents, _, parameters = policy.select_target(policy.actor_target, policy.critic, features, masks=masks)
-    q1, q2 = (parts.sum(dim=1, keepdim=True) for parts in policy.critic_target.parts(features, latents, parameters))
-    return policy.value_scale.values(th.min(q1, q2))
+    q1, q2 = policy.critic_target.outputs(features, latents, parameters)
+    return policy.value_scale.values(th.min(q1[:, :1], q2[:, :1]))
 
 
 @th.no_grad()
 def target_values(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> th.Tensor:
     """
-    Both parts of eq. 11, y = r + gamma min_j Q'_j(s', e', a'), see :func:`next_values`.
+    Eq. 11, y = r + gamma min_j Q'_j(s', e', a'), see :func:`next_values`, and r alone.
 
     :param policy: the networks
     :param replay_data: a batch
-    :return: (B, 2) rewards and what follows them, in the units of the rewards
+    :return: (B, 2) values and rewards, in the units of the rewards
     """
     values = next_values(policy, replay_data.next_observations, replay_data.next_masks)
-    return th.cat([replay_data.rewards, (1 - replay_data.dones) * replay_data.discounts * values], dim=1)
+    follows = (1 - replay_data.dones) * replay_data.discounts * values
+    return th.cat([replay_data.rewards + follows, replay_data.rewards], dim=1)
 
 
 def critic_loss(
     policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, targets: th.Tensor
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """
-    Eq. 10, (Q_j(s, e, a) - y)^2, for each part of Q, weighted if the replay is prioritised.
+    Eq. 10, (Q_j(s, e, a) - y)^2, and the same for the reward alone, weighted if the replay is prioritised.
 
     It has a gradient for the codebook, which may be used.
 
     :param policy: the networks
     :param replay_data: a batch
     :param features: (B, features_dim) features of the observations
-    :param targets: (B, n_parts) targets y in the units of the critics
-    :return: sum over both critics, the detached (B, n_parts) parts of the first, and the larger (B,) absolute error of both
+    :param targets: (B, n_outputs) targets in the units of the critics
+    :return: sum over both critics, the detached (B, n_outputs) outputs of the first, and the larger (B,) absolute error of both
+        about the value
     """
     # The gradient with respect to a latent is also that of its codeword, as if the one moved with the other
     codewords = policy.actor.codebook(replay_data.discrete_actions)
     latents = replay_data.latents + (codewords - codewords.detach())
-    parts = th.stack(policy.critic.parts(features, latents, replay_data.parameters), dim=1)
-    errors = parts - targets[:, None]
-    loss = (replay_data.weights * errors.square().sum(dim=2)).sum(dim=1).mean()
-    return loss, parts[:, 0].detach(), errors.detach().sum(dim=2).abs().amax(dim=1)
+    outputs = th.stack(policy.critic.outputs(features, latents, replay_data.parameters), dim=1)
+    errors = outputs - targets[:, None]
+    loss = (replay_data.weights * (errors.square() @ policy.value_scale.loss_weights)).sum(dim=1).mean()
+    return loss, outputs[:, 0].detach(), errors.detach()[:, :, 0].abs().amax(dim=1)
 
 
 def discrete_policy_loss(

@@ -31,7 +31,7 @@ class PaperQNetwork(nn.Module):
         self.mlp = nn.Sequential(*create_mlp(n_inputs, 1, net_arch, activation_fn))
 
     def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-        """:return: (B, 1) values, in one part"""
+        """:return: (B, 1) values"""
         return self.mlp(th.cat([features, latents, parameters], dim=1))
 
 
@@ -56,7 +56,7 @@ class PaperPolicy(CHDPPolicy):
         return HybridCritic(self.observation_space, self.action_space, extractor, q_networks, 1, self.normalize_images)
 
     def in_units_of_critics(self, targets: th.Tensor) -> th.Tensor:
-        return targets.sum(dim=1, keepdim=True)
+        return targets[:, :1]
 
     def _make_selections(self) -> tuple[Selection, Selection, Selection]:
         one = Selection(n_drawn=1)

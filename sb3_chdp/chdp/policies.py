@@ -109,7 +109,7 @@ class CHDPPolicy(HybridPolicy):
         for target in (self.actor_target, self.critic_target):
             target.requires_grad_(False)
             target.train(False)
-        self.value_scale = ValueScale(len(self.critic.part_weights), self.adapts_values)
+        self.value_scale = ValueScale(len(self.critic.output_weights), self.adapts_values)
         self.select, self.select_deterministic, self.select_target = self._make_selections()
 
         actor = self.actor
@@ -228,8 +228,8 @@ class CHDPPolicy(HybridPolicy):
         """
         Adapt the units of the critics to new targets; values stay what they were.
 
-        :param targets: (B, 2) rewards and what follows them, in the units of the rewards
-        :return: (B, n_parts) what the critics ought to put out
+        :param targets: (B, 2) values and rewards, in the units of the rewards
+        :return: (B, n_outputs) what the critics ought to put out
         """
         if self.value_scale.adapts and (change := self.value_scale.update(targets)) is not None:
             for critic in (self.critic, self.critic_target):
@@ -241,7 +241,7 @@ class CHDPPolicy(HybridPolicy):
         :param weight: weight in [0, 1] of what follows a reward in the choice of actions, see :class:`ForesightSums`
         """
         for critic in (self.critic, self.critic_target):
-            critic.part_weights[1:] = weight
+            critic.output_weights[0], critic.output_weights[1:] = weight, 1 - weight
 
     def set_training_mode(self, mode: bool) -> None:
         """

@@ -12,11 +12,11 @@ MAX_OUTPUT = 20.0
 
 class ValueScale(nn.Module):
     """
-    A part of a value is ``center + scale * output`` of the critics: mean of its targets so far, and the root of the sum of all
-    parts' variances. When these change, the critics' last layers do as well, so that values stay (PopArt, van Hasselt et al.,
-    2016). At first all values are 0, whatever the critics put out.
+    What an output of the critics stands for is ``center + scale * output``: the mean of its targets so far, and the standard
+    deviation of those of the first, the values. When these change, the critics' last layers do as well, so that values stay
+    (PopArt, van Hasselt et al., 2016). At first all values are 0, whatever the critics put out.
 
-    :param n_parts: number of parts of a value
+    :param n_outputs: number of outputs
     :param adapts: False: values are what the critics put out, for ever
     """
 
@@ -24,38 +24,43 @@ class ValueScale(nn.Module):
     variance: th.Tensor
     n_batches: th.Tensor
 
-    def __init__(self, n_parts: int, adapts: bool = True) -> None:
+    def __init__(self, n_outputs: int, adapts: bool = True) -> None:
         super().__init__()
         self.adapts = adapts
-        for name, shape in (("center", (n_parts,)), ("variance", ()), ("n_batches", ())):
+        for name, shape in (("center", (n_outputs,)), ("variance", (n_outputs,)), ("n_batches", ())):
             self.register_buffer(name, th.zeros(shape, dtype=th.float64))
         self.variance += not adapts
 
     @property
     def scale(self) -> th.Tensor:
         """:return: () difference of values for a difference of 1 in the output"""
-        return self.variance.sqrt().clamp(min=MIN_SCALE)
+        return self.variance[0].sqrt().clamp(min=MIN_SCALE)
+
+    @property
+    def loss_weights(self) -> th.Tensor:
+        """:return: (n_outputs,) weights of the outputs' squared errors: none counts for more than the values"""
+        return (self.scale.square() / self.variance.clamp(min=MIN_SCALE**2)).clamp(max=1).float()
 
     def values(self, outputs: th.Tensor) -> th.Tensor:
         """
-        :param outputs: (B, 1) sums of the parts that the critics put out
+        :param outputs: (B, 1) first outputs of critics
         :return: (B, 1) values in the units of the rewards
         """
-        return (self.center.sum() + self.scale * outputs.double()).float()
+        return (self.center[0] + self.scale * outputs.double()).float()
 
-    def outputs(self, parts: th.Tensor) -> th.Tensor:
+    def outputs(self, targets: th.Tensor) -> th.Tensor:
         """
-        :param parts: (B, n_parts) parts of values, in the units of the rewards
-        :return: (B, n_parts) what critics put out for them, at most ``MAX_OUTPUT`` from 0 if the scale adapts
+        :param targets: (B, n_outputs) in the units of the rewards
+        :return: (B, n_outputs) what critics put out for them, at most ``MAX_OUTPUT`` from 0 if the scale adapts
         """
-        outputs = ((parts.double() - self.center) / self.scale).float()
+        outputs = ((targets.double() - self.center) / self.scale).float()
         return outputs.clamp(-MAX_OUTPUT, MAX_OUTPUT) if self.adapts else outputs
 
     @th.no_grad()
     def update(self, targets: th.Tensor) -> tuple[th.Tensor, th.Tensor] | None:
         """
-        :param targets: (B, n_parts) targets of the critics, in the units of the rewards
-        :return: () factor and (n_parts,) summands for the critics' outputs, so that the values stay what they were, None if
+        :param targets: (B, n_outputs) targets of the critics, in the units of the rewards
+        :return: () factor and (n_outputs,) summands for the critics' outputs, so that the values stay what they were, None if
             nothing is to change
         """
         center, scale = self.center.clone(), self.scale
@@ -64,9 +69,8 @@ class ValueScale(nn.Module):
         self.n_batches += 1
         weight = (1 / self.n_batches).clamp(min=MIN_UPDATE_WEIGHT)
         shift = targets.double().mean(dim=0) - center
-        # Not of the sum: parts may cancel
-        variances = targets.double().var(dim=0, correction=0)
-        self.variance.lerp_((variances + (1 - weight) * shift.square()).sum(), weight)
+        variance = targets.double().var(dim=0, correction=0)
+        self.variance.lerp_(variance + (1 - weight) * shift.square(), weight)
         self.center += weight * shift
         if scale <= MIN_SCALE:
             return None
