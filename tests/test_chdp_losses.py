@@ -36,7 +36,7 @@ def networks_with_gradient(model, loss):
 def all_losses(model, parameters="drawn"):
     data, policy = sample(model), model.policy
     features = policy.critic.features(data.observations)
-    targets = policy.value_scale.outputs(losses.target_values(policy, data))
+    targets = policy.in_units_of_critics(losses.target_values(policy, data))
     critic, *_ = losses.critic_loss(policy, data, features, targets)
     features = features.detach()
     stored = data.parameters if parameters == "stored" else None
@@ -137,7 +137,7 @@ def test_parameters_with_which_latents_are_valued(parameters):
 
 @BOTH
 def test_target_values(algorithm_class):
-    """r and gamma (1 - d) min Q' of the next action that the online critics select; n-step discounts replace gamma."""
+    """r + gamma (1 - d) min Q' of the next action that the online critics select, and r; n-step discounts replace gamma."""
     model = filled_model(algorithm_class=algorithm_class, gamma=0.9)
     policy, critic = model.policy, model.critic_target
     data = sample(model)._replace(dones=(th.arange(32)[:, None] % 2).float())
@@ -148,14 +148,14 @@ def test_target_values(algorithm_class):
         with th.no_grad():
             latents, _, parameters = policy.select_target(policy.actor_target, model.critic, features)
             next_values = policy.value_scale.values(th.min(*critic.q_values(features, latents, parameters)))
-        return th.cat([data.rewards, discounts * (1 - data.dones) * next_values], dim=1)
+        return th.cat([data.rewards + discounts * (1 - data.dones) * next_values, data.rewards], dim=1)
 
     for discounts in (0.9, th.full((32, 1), 0.1)):
         th.manual_seed(0)
         targets = losses.target_values(policy, data._replace(discounts=discounts))
         th.testing.assert_close(targets, expected(discounts))
         assert targets.shape == (32, 2) and not targets.requires_grad
-        assert (targets[1::2, 1] == 0).all() and (targets[::2, 1] != 0).all()
+        assert ((targets[:, 0] == targets[:, 1]) == (data.dones[:, 0] == 1)).all()
 
 
 def test_next_values_are_whole_without_foresight():
@@ -171,25 +171,29 @@ def test_next_values_are_whole_without_foresight():
     latents, _, parameters = policy.select_target(policy.actor_target, model.critic, features)
     policy.set_foresight(1.0)
     q_values = th.min(*model.critic_target.q_values(features, latents, parameters))
-    th.testing.assert_close(targets[:, 1:], 0.9 * policy.value_scale.values(q_values))
+    th.testing.assert_close(targets[:, :1], data.rewards + 0.9 * policy.value_scale.values(q_values))
 
 
 @BOTH
 def test_critic_loss(algorithm_class):
     """The sum of all squared errors, weighted; priorities follow the larger error of both critics."""
     model = filled_model(algorithm_class=algorithm_class)
-    data, n_parts = sample(model), len(model.critic.part_weights)
-    targets, features = th.randn(32, n_parts), model.critic.features(data.observations)
-    q1, q2 = model.critic.parts(features, data.latents, data.parameters)
-    loss, parts, errors = losses.critic_loss(model.policy, data._replace(weights=1.0), features, targets)
-    th.testing.assert_close(loss, n_parts * (F.mse_loss(q1, targets) + F.mse_loss(q2, targets)))
-    th.testing.assert_close(parts, q1.detach())
-    expected = th.stack([(q - targets).sum(dim=1).abs() for q in (q1, q2)]).amax(dim=0)
+    data, n_outputs = sample(model), len(model.critic.output_weights)
+    targets, features = th.randn(32, n_outputs), model.critic.features(data.observations)
+    # Rewards vary twice as much as values
+    squares = th.tensor([1.0, 4.0][:n_outputs])
+    model.policy.value_scale.variance.copy_(squares)
+    q1, q2 = model.critic.outputs(features, data.latents, data.parameters)
+    loss, outputs, errors = losses.critic_loss(model.policy, data._replace(weights=1.0), features, targets)
+    of_rows = sum(((q - targets) ** 2 / squares).sum(dim=1) for q in (q1, q2))
+    th.testing.assert_close(loss, of_rows.mean())
+    th.testing.assert_close(outputs, q1.detach())
+    expected = th.stack([(q - targets)[:, 0].abs() for q in (q1, q2)]).amax(dim=0)
     th.testing.assert_close(errors, expected.detach())
     one = th.zeros(32, 1)
     one[3] = 1.0
     weighted, *_ = losses.critic_loss(model.policy, data._replace(weights=one), features, targets)
-    th.testing.assert_close(weighted, ((q1[3] - targets[3]) ** 2 + (q2[3] - targets[3]) ** 2).sum() / 32)
+    th.testing.assert_close(weighted, of_rows[3] / 32)
 
 
 def test_alpha_normalises_by_q():

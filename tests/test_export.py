@@ -92,7 +92,7 @@ def test_a_trained_model(tmp_path):
     _, (k, parameters) = export(model, tmp_path / "policy.onnx", observations, observations[:2])
     values = [[], []]
     for network, kept in zip(model.critic_target.q_networks, values, strict=True):
-        network.register_forward_hook(lambda module, args, parts, kept=kept: kept.append(parts.detach().sum(dim=1)))
+        network.register_forward_hook(lambda module, args, outputs, kept=kept: kept.append(outputs.detach()[:, 0]))
     with th.no_grad():
         own_k, own_parameters = (part.numpy() for part in ExportablePolicy(model.policy)(observations))
     of_all = th.min(values[0][0], values[1][0]).view(N, -1)

@@ -67,7 +67,7 @@ def test_what_decides_between_actions(foresight):
     for critic in (model.critic, model.critic_target):
         features = critic.features(data.observations)
         inputs = (features, data.latents, data.parameters)
-        expected = [parts[:, :1] + foresight * parts[:, 1:] for parts in critic.parts(*inputs)]
+        expected = [foresight * q[:, :1] + (1 - foresight) * q[:, 1:] for q in critic.outputs(*inputs)]
         th.testing.assert_close(list(critic.q_values(*inputs)), expected)
         th.testing.assert_close(critic.q1_values(*inputs), expected[0])
 
@@ -104,7 +104,7 @@ def test_claims_come_true_where_actions_have_influence():
         model = fast_model(env=Pairs(random), learning_starts=100, gamma=0.9, train_freq=2, batch_size=64).learn(800)
         sums.append(model.foresight_sums)
         for critic in (model.critic, model.critic_target):
-            assert critic.part_weights[1].item() == pytest.approx(model.foresight_sums.weight())
+            assert critic.output_weights[0].item() == pytest.approx(model.foresight_sums.weight())
     assert sums[1].xy / sums[1].xx > 0.5 and sums[1].weight() == 1
     assert abs(sums[0].xy) < 0.2 * sums[1].xy
 
@@ -118,7 +118,8 @@ def test_it_is_saved(tmp_path):
     model.save(tmp_path / "model")
     loaded = CHDP.load(tmp_path / "model", env=Pairs(False))
     assert ForesightSums(*loaded.foresight_sums) == model.foresight_sums
-    assert loaded.critic.part_weights[1] == loaded.critic_target.part_weights[1] == model.critic.part_weights[1]
+    for critic in (loaded.critic, loaded.critic_target):
+        assert critic.output_weights.tolist() == [[0.25], [0.75]] == model.critic.output_weights.tolist()
     loaded.learn(30, reset_num_timesteps=False)
 
 
@@ -127,7 +128,8 @@ def test_ends_of_episodes(monkeypatch):
     model = filled_model(DummyVecEnv([lambda: make_layout_env("nested")] * 3))
     monkeypatch.setattr(exploring, "next_values", lambda policy, observation, masks: th.full((3, 1), 7.0))
     model.policy.value_scale.variance += 4 - model.policy.value_scale.variance
-    model.policy.value_scale.center[1] = 2.0
+    # Means of values and rewards
+    model.policy.value_scale.center += th.tensor([3.0, 1.0])
     claims = Claims(None, np.arange(3), np.array([1.0, 10.0, 100.0]), np.array([0.5, 0.5, 0.5]))
     infos = [{}, {}, {"TimeLimit.truncated": True}]
     model._check_claims(claims, model._last_obs, np.array([False, True, True]), infos)
@@ -144,4 +146,4 @@ def test_masks_and_several_environments():
 def test_the_paper_looks_ahead():
     model = fast_model(PaperCHDP, learning_starts=10)
     model.learn(40)
-    assert model.critic.part_weights.tolist() == [[1.0]] and model.foresight_sums == ForesightSums()
+    assert model.critic.output_weights.tolist() == [[1.0]] and model.foresight_sums == ForesightSums()

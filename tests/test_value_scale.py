@@ -12,26 +12,26 @@ from tests.hybrid_envs import HybridIdentityEnv
 
 
 @pytest.mark.parametrize("spread", [1e-3, 1.0, 1e4])
-def test_outputs_have_zero_mean_and_unit_variance(spread):
+def test_outputs_have_zero_mean_and_values_unit_variance(spread):
     value_scale, generator = ValueScale(2), th.Generator().manual_seed(0)
-    # Rewards of mean 10, and what follows of mean -40: values of mean -30 and standard deviation 5
-    targets = spread * (th.tensor([3.0, 4.0]) * th.randn(600, 64, 2, generator=generator) + th.tensor([10.0, -40.0]))
+    # Values of mean -30 and standard deviation 5, rewards of mean 10 and standard deviation 2
+    targets = spread * (th.tensor([5.0, 2.0]) * th.randn(600, 64, 2, generator=generator) + th.tensor([-30.0, 10.0]))
     for batch in targets:
         value_scale.update(batch)
-    assert value_scale.center.tolist() == pytest.approx([10 * spread, -40 * spread], rel=0.05)
+    assert value_scale.center.tolist() == pytest.approx([-30 * spread, 10 * spread], rel=0.05)
     assert value_scale.scale.item() == pytest.approx(5 * spread, rel=0.05)
     outputs = value_scale.outputs(targets)
-    total = outputs.sum(dim=2, keepdim=True)
-    assert total.std().item() == pytest.approx(1, abs=0.05) and outputs.mean(dim=(0, 1)).abs().max() < 0.1
-    th.testing.assert_close(value_scale.values(total), targets.sum(dim=2, keepdim=True), rtol=1e-4, atol=1e-4 * spread)
+    np.testing.assert_allclose(outputs.std(dim=(0, 1)), [1, 0.4], rtol=0.05)
+    assert outputs.mean(dim=(0, 1)).abs().max() < 0.1
+    th.testing.assert_close(value_scale.values(outputs[..., :1]), targets[..., :1], rtol=1e-4, atol=1e-4 * spread)
 
 
-def test_parts_that_cancel_are_of_unit_size_too():
-    value_scale, rewards = ValueScale(2), th.randn(600, 64, 1)
-    targets = 5 * th.cat([rewards, 0.01 * th.randn(600, 64, 1) - rewards], dim=2)
-    for batch in targets:
-        value_scale.update(batch)
-    np.testing.assert_allclose(value_scale.outputs(targets).std(dim=(0, 1)), np.sqrt(0.5), rtol=0.05)
+@pytest.mark.parametrize("spread_of_rewards, weight", [(0.1, 1.0), (1.0, 1.0), (10.0, 0.01), (0.0, 1.0)])
+def test_rewards_count_for_no_more_than_values_in_the_loss(spread_of_rewards, weight):
+    value_scale, generator = ValueScale(2), th.Generator().manual_seed(0)
+    for _ in range(600):
+        value_scale.update(th.tensor([1.0, spread_of_rewards]) * th.randn(64, 2, generator=generator))
+    np.testing.assert_allclose(value_scale.loss_weights, [1, weight], rtol=0.1)
 
 
 def test_what_untrained_critics_put_out_is_no_value():

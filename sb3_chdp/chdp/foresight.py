@@ -1,8 +1,8 @@
 """
 How far CHDP trusts what its critics say about the future: where actions have no influence on it, that is noise.
 
-The critics learn rewards beside values, which leaves what follows. Exploratory actions are random draws, so that only their effect tells
-what follows one from what follows others: what the critics claim of it can be compared with what did follow.
+The critics learn rewards beside values: the difference is what follows. Exploratory actions are random draws, so that only
+their effect tells what follows one from what follows others: what the critics claim of it can be compared with what did.
 """
 
 from typing import NamedTuple
