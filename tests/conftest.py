@@ -1,4 +1,5 @@
 import multiprocessing
+import os
 
 import pytest
 import torch as th
@@ -6,6 +7,8 @@ from hypothesis import settings
 
 from tests.algorithms import ALGORITHMS, OFF_POLICY_ALGORITHMS
 
+# Most tests compare with tensors on the processor; those of a GPU are in test_gpu.py
+os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")
 # For once: pytest --hypothesis-profile=thorough
 settings.register_profile("thorough", max_examples=10_000)
 # Small networks: more threads are slower, and tests may run side by side

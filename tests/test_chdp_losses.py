@@ -4,7 +4,6 @@ import itertools
 
 import pytest
 import torch as th
-from torch.nn import functional as F
 
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import PaperCHDP, losses

@@ -67,8 +67,8 @@ def critic_loss(
     :param replay_data: a batch
     :param features: (B, features_dim) features of the observations
     :param targets: (B, n_outputs) targets in the units of the critics
-    :return: sum over both critics, the detached (B, n_outputs) outputs of the first, and the larger (B,) absolute error of both
-        about the value
+    :return: sum over both critics, the detached (B, n_outputs) outputs of the first, and the larger (B,) of both absolute
+        errors of values
     """
     # The gradient with respect to a latent is also that of its codeword, as if the one moved with the other
     codewords = policy.actor.codebook(replay_data.discrete_actions)
