@@ -1,7 +1,7 @@
 """
 MkDocs hook: the pages of the algorithms are those of the registry.
 
-``Algorithms: registry`` in the navigation becomes a page per algorithm, ``<!-- algorithms -->`` a list of them. One without a
+``Algorithms: registry`` in the navigation becomes a page per algorithm, ``<!-- algorithms -->`` links to them. One without a
 page of its own in ``docs/modules`` gets the docstring of its class. ``::: sb3_chdp.CHDP`` is looked up where the class is
 written.
 """
@@ -36,7 +36,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    links = "\n".join(f"* [{name}]({page})" for name, page in PAGES.items())
+    links = ", ".join(f"[{name}]({page})" for name, page in PAGES.items())
     markdown = markdown.replace("<!-- algorithms -->", links)
     for algorithm in ALGORITHMS.values():
         markdown = markdown.replace(f"::: sb3_chdp.{algorithm.class_name}\n", f"::: {algorithm.class_path}\n")
