@@ -10,15 +10,16 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import PaperCHDP, exploring
-from sb3_chdp.chdp.foresight import MIN_CLAIMS, Claims, ForesightSums, explore, what_follows
+from sb3_chdp.chdp.foresight import MIN_CLAIMS, Claims, ForesightSums, expected_outcomes, explore
 from tests.algorithms import fast_model, filled_model, sample
 from tests.hybrid_envs import MaskedEnv, box, make_layout_env
 
 
 def weight(slope, noise, n=2000):
+    """What is claimed of rewards comes true, of what follows a share."""
     rng, sums = np.random.default_rng(0), ForesightSums()
-    for x in rng.normal(size=n):
-        sums = sums.add(x, slope * x + noise * rng.normal())
+    for reward, follows in rng.normal(size=(n, 2)):
+        sums = sums.add(reward, follows, reward + slope * follows + noise * rng.normal())
     return sums.weight()
 
 
@@ -29,17 +30,26 @@ def test_the_weight_is_what_comes_true_of_claims():
     assert weight(slope=-0.5, noise=1.0) == 0
 
 
+def test_errors_that_make_up_for_each_other_are_none():
+    """Whether the reward is had at once, or follows, is often the last thing that critics learn."""
+    rng, sums = np.random.default_rng(0), ForesightSums()
+    for reward, follows, error in rng.normal(size=(2000, 3)) * [1, 1, 10]:
+        sums = sums.add(reward + error, follows - error, reward + follows + 0.1 * rng.normal())
+    assert sums.fy / sums.ff < 0.1 and sums.weight() == 1
+
+
 def test_the_benefit_of_the_doubt():
     assert weight(slope=-1.0, noise=0.1, n=MIN_CLAIMS - 1) == 1
     assert weight(slope=0.0, noise=100.0) == 1
     assert ForesightSums(n=100.0, yy=1.0).weight() == 1, "nothing was claimed"
+    assert ForesightSums(n=100.0, rr=1.0, rf=1.0, ff=1.0, yy=1.0).weight() == 1, "the same was claimed of both"
 
 
 def test_old_claims_fade():
     sums = ForesightSums()
     for slope in (0.0, 1.0):
-        for x in np.random.default_rng(0).normal(size=3000):
-            sums = sums.add(x, slope * x)
+        for reward, follows in np.random.default_rng(0).normal(size=(3000, 2)):
+            sums = sums.add(reward, follows, reward + slope * follows)
     assert sums.weight() == 1 and sums.n < 501
 
 
@@ -52,11 +62,13 @@ def test_claims_are_what_the_critics_say():
     claims = explore(model.policy, obs, rows, envs, np.random.default_rng(0))
     assert claims.rows.shape == rows.shape and (claims.envs == envs).all()
     with th.no_grad():
-        said = what_follows(model.policy, model.critic_target.features(obs)[envs], claims.rows).numpy()
-    means = said - claims.advantages
+        values = expected_outcomes(model.policy, model.critic_target.features(obs)[envs], claims.rows)[:, 0].numpy()
+    assert abs(claims.rewards.mean()) < 3 * claims.rewards.std() / np.sqrt(150)
+    advantages = claims.rewards + claims.follows
+    means = values - advantages
     # Two estimates of the same means
     assert np.corrcoef(means, claims.expected)[0, 1] > 0.5 and np.abs(means - claims.expected).max() > 1e-6
-    assert abs(claims.advantages.mean()) < 3 * claims.advantages.std() / np.sqrt(150)
+    assert abs(advantages.mean()) < 3 * advantages.std() / np.sqrt(150)
 
 
 @pytest.mark.parametrize("foresight", [0.0, 0.5, 1.0])
@@ -105,14 +117,14 @@ def test_claims_come_true_where_actions_have_influence():
         sums.append(model.foresight_sums)
         for critic in (model.critic, model.critic_target):
             assert critic.output_weights[0].item() == pytest.approx(model.foresight_sums.weight())
-    assert sums[1].xy / sums[1].xx > 0.5 and sums[1].weight() == 1
-    assert abs(sums[0].xy) < 0.2 * sums[1].xy
+    assert sums[1].fy / sums[1].ff > 0.5 and sums[1].weight() == 1
+    assert abs(sums[0].fy) < 0.2 * sums[1].fy
 
 
 def test_it_is_saved(tmp_path):
     model = fast_model(env=Pairs(False))
     model.policy.set_foresight(0.25)
-    model.foresight_sums = ForesightSums(50.0, 1.0, 0.5, 2.0)
+    model.foresight_sums = ForesightSums(50.0, 1.0, 0.0, 1.0, 1.0, 0.1, 2.0)
     # Saves between an exploratory action and what follows it
     model.learn(30, CheckpointCallback(10, str(tmp_path)))
     model.save(tmp_path / "model")
@@ -128,13 +140,13 @@ def test_ends_of_episodes(monkeypatch):
     model = filled_model(DummyVecEnv([lambda: make_layout_env("nested")] * 3))
     monkeypatch.setattr(exploring, "next_values", lambda policy, observation, masks: th.full((3, 1), 7.0))
     model.policy.value_scale.variance += 4 - model.policy.value_scale.variance
-    # Means of values and rewards
-    model.policy.value_scale.center += th.tensor([3.0, 1.0])
-    claims = Claims(None, np.arange(3), np.array([1.0, 10.0, 100.0]), np.array([0.5, 0.5, 0.5]))
+    model.policy.value_scale.center[0] = 2.0
+    claims = Claims(None, np.arange(3), np.zeros(3), np.array([1.0, 10.0, 100.0]), np.array([0.5, 0.5, 0.5]))
     infos = [{}, {}, {"TimeLimit.truncated": True}]
-    model._check_claims(claims, model._last_obs, np.array([False, True, True]), infos)
-    goes_on, ends = (7.0 * model.gamma - 2) / 2 - 0.5, (0 - 2) / 2 - 0.5
-    assert model.foresight_sums.xy == pytest.approx(goes_on + 10 * ends, rel=0.01)
+    rewards = np.array([3.0, 4.0, 5.0], dtype=np.float32)
+    model._check_claims(claims, model._last_obs, rewards, np.array([False, True, True]), infos)
+    goes_on, ends = (3 + 7 * model.gamma - 2) / 2 - 0.5, (4 - 2) / 2 - 0.5
+    assert model.foresight_sums.fy == pytest.approx(goes_on + 10 * ends, rel=0.01)
 
 
 def test_masks_and_several_environments():

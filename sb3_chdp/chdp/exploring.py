@@ -51,10 +51,10 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
 
     def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any) -> None:
         super()._store_transition(replay_buffer, *args)
-        _, new_obs, _, dones, infos = args
+        _, new_obs, rewards, dones, infos = args
         self._count_returns(replay_buffer)
         if self._claims is not None and self._n_updates >= MIN_UPDATES and self.n_steps == 1:
-            self._check_claims(self._claims, new_obs, dones, infos)
+            self._check_claims(self._claims, new_obs, rewards, dones, infos)
         self._claims = None
 
     def _count_returns(self, replay_buffer: ReplayBuffer) -> None:
@@ -71,20 +71,22 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         self.return_sums = returns
         self.n_informative_steps += informative_steps(self.n_envs, returns)
 
-    def _check_claims(self, claims: Claims, new_obs: Any, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
-        """Compare what was claimed to follow exploratory actions with the values of what did."""
+    def _check_claims(
+        self, claims: Claims, new_obs: Any, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
+    ) -> None:
+        """Compare what was claimed to come of exploratory actions with the rewards and the values of what followed."""
         masks = self._action_masks()
         next_masks = None if masks is None else th.as_tensor(masks, device=self.device)
         values = next_values(self.policy, self.policy.obs_to_tensor(new_obs)[0], next_masks)
-        values = self.gamma * values * th.as_tensor(1.0 - dones, dtype=th.float32, device=self.device)[:, None]
-        # As the difference of the critics' outputs
-        center, scale = self.policy.value_scale.center, self.policy.value_scale.scale
-        followed = ((values[:, 0] - (center[0] - center[1])) / scale).tolist()
+        came = th.as_tensor(rewards, device=self.device) + self.gamma * values[:, 0] * th.as_tensor(
+            1 - dones, device=self.device
+        )
+        outputs = self.policy.value_scale.outputs(th.stack([came, came], dim=1))[:, 0].tolist()
         sums = ForesightSums(*self.foresight_sums)  # a list in a loaded model
-        for i, advantage, expected in zip(claims.envs, claims.advantages, claims.expected, strict=True):
+        for i, reward, follows, expected in zip(claims.envs, claims.rewards, claims.follows, claims.expected, strict=True):
             # A new episode has begun where a time limit was reached: its first state is not what followed
             if not infos[i].get("TimeLimit.truncated", False):
-                sums = sums.add(float(advantage), followed[i] - float(expected))
+                sums = sums.add(float(reward), float(follows), outputs[i] - float(expected))
         self.foresight_sums = sums
         self.policy.set_foresight(sums.weight())
 

@@ -2,7 +2,7 @@
 How far CHDP trusts what its critics say about the future: where actions have no influence on it, that is noise.
 
 The critics learn rewards beside values: the difference is what follows. Exploratory actions are random draws, so that only
-their effect tells what follows one from what follows others: what the critics claim of it can be compared with what did.
+their effect tells what comes of one from what comes of others: what the critics claim of it can be compared with what did.
 """
 
 from typing import NamedTuple
@@ -28,56 +28,59 @@ class Claims(NamedTuple):
 
     :ivar rows: (n, columns) the actions
     :ivar envs: (n,) indices of their environments
-    :ivar advantages: (n,) how much more is said to follow each than follows others on average
-    :ivar expected: (n,) what is said to follow others on average
+    :ivar rewards: (n,) how much more reward each is said to get than others on average
+    :ivar follows: (n,) how much more is said to follow it than follows others on average
+    :ivar expected: (n,) what others are said to be worth on average
     """
 
     rows: np.ndarray
     envs: np.ndarray
-    advantages: np.ndarray
+    rewards: np.ndarray
+    follows: np.ndarray
     expected: np.ndarray
 
 
 class ForesightSums(NamedTuple):
     """
-    Sums over claimed advantages x and the differences y of what did follow from what was expected; old ones fade.
-
-    :ivar n: number of claims
-    :ivar xx: sum of squares of x
-    :ivar xy: sum of products
-    :ivar yy: sum of squares of y
+    Sums of products of claims r and f, about the reward and what follows, and the difference y of what came from what was
+    expected; old ones fade.
     """
 
     n: float = 0.0
-    xx: float = 0.0
-    xy: float = 0.0
+    rr: float = 0.0
+    rf: float = 0.0
+    ff: float = 0.0
+    ry: float = 0.0
+    fy: float = 0.0
     yy: float = 0.0
 
-    def add(self, x: float, y: float) -> "ForesightSums":
+    def add(self, r: float, f: float, y: float) -> "ForesightSums":
         """:return: the sums with one more claim"""
-        kept = 1 - 1 / N_REMEMBERED
-        return ForesightSums(*(kept * a + b for a, b in zip(self, (1.0, x * x, x * y, y * y), strict=True)))
+        kept, products = 1 - 1 / N_REMEMBERED, (1.0, r * r, r * f, f * f, r * y, f * y, y * y)
+        return ForesightSums(*(kept * a + b for a, b in zip(self, products, strict=True)))
 
     def weight(self) -> float:
         """
         How much what follows is to count in the choice of actions: less than 1 if not even half of what is claimed comes true.
 
-        :return: twice the slope of y over x, with the benefit of the doubt, within [0, 1]
+        Least squares of y on both claims: an error about the reward that one about what follows makes up for is none.
+
+        :return: twice the coefficient of f, with the benefit of the doubt, within [0, 1]
         """
-        n, xx, xy, yy = self
-        if n < MIN_CLAIMS or xx == 0:
+        n, rr, rf, ff, ry, fy, yy = self
+        determinant = rr * ff - rf * rf
+        if n < MIN_CLAIMS or determinant <= 1e-6 * rr * ff:
             return 1.0
-        slope = xy / xx
-        error = np.sqrt(max(yy - slope * xy, 0) / (n * xx))
-        return float(np.clip(2 * (slope + N_ERRORS * error), 0, 1))
+        of_rewards, of_follows = (ff * ry - rf * fy) / determinant, (rr * fy - rf * ry) / determinant
+        error = np.sqrt(max(yy - of_rewards * ry - of_follows * fy, 0) / n * rr / determinant)
+        return float(np.clip(2 * (of_follows + N_ERRORS * error), 0, 1))
 
 
-def what_follows(policy: CHDPPolicy, features: th.Tensor, rows: np.ndarray) -> th.Tensor:
-    """:return: (n,) discounted values that the target critics expect after actions, mean of both, in the critics' units"""
+def expected_outcomes(policy: CHDPPolicy, features: th.Tensor, rows: np.ndarray) -> th.Tensor:
+    """:return: (n, 2) values and rewards that the target critics expect of actions, mean of both, in the critics' units"""
     columns, actions = policy.action_space.columns, th.as_tensor(rows, device=policy.device)
     latents, parameters = columns.view(actions, "latents"), columns.view(actions, "parameters")
-    values, rewards = th.stack(policy.critic_target.outputs(features, latents, parameters)).mean(dim=0).unbind(dim=1)
-    return values - rewards
+    return th.stack(policy.critic_target.outputs(features, latents, parameters)).mean(dim=0)
 
 
 @th.no_grad()
@@ -103,7 +106,8 @@ def explore(
     features = policy.critic_target.features(observation)[envs].repeat_interleave(n_draws, dim=0)
     masks = None if masks is None else np.repeat(masks, n_draws, axis=0)
     drawn = vary_parts(policy, features, np.repeat(rows, n_draws, axis=0), rng, masks)
-    follows = what_follows(policy, features, drawn).view(-1, n_draws).cpu().numpy()
+    expected = expected_outcomes(policy, features, drawn).view(-1, n_draws, 2).cpu().numpy()
     # Two means, or their error would be an agreement of claim and outcome
-    some, others = follows[:, 1 : 1 + N_OTHERS].mean(axis=1), follows[:, 1 + N_OTHERS :].mean(axis=1)
-    return Claims(drawn[::n_draws], envs, follows[:, 0] - some, others)
+    some, others = expected[:, 1 : 1 + N_OTHERS].mean(axis=1), expected[:, 1 + N_OTHERS :].mean(axis=1)
+    values, rewards = (expected[:, 0] - some).T
+    return Claims(drawn[::n_draws], envs, rewards, values - rewards, others[:, 0])
