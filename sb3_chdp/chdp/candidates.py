@@ -72,7 +72,7 @@ class Candidates(NamedTuple):
         """
         n = self.latents.shape[1]
         inputs = features.repeat_interleave(n, dim=0), self.latents.flatten(0, 1), self.parameters.flatten(0, 1)
-        return th.min(*critic.q_values(*inputs)).view(-1, n)
+        return th.min(*critic.scores(*inputs)).view(-1, n)
 
     def best(self, critic: HybridCritic, features: th.Tensor, allowed: th.Tensor | None = None) -> SelectedActions:
         """

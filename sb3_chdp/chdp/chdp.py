@@ -49,7 +49,7 @@ class CHDP(ExploringAlgorithm):
            stored ones, and the continuous policy for uniformly random discrete actions too;
         6. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate`,
            :func:`informative_steps` and :func:`vary_parts`;
-        7. critics learn rewards beside values, and what follows a reward counts less in the choice of actions where
+        7. a network learns rewards, and what follows a reward counts less in the choice of actions where
            exploratory actions have shown no influence on it, see :class:`ForesightSums`;
         8. the learning rate falls linearly to 0.
 
@@ -224,18 +224,20 @@ class CHDP(ExploringAlgorithm):
             targets = policy.in_units_of_critics(target_values(policy, replay_data))
             features = policy.critic.features(replay_data.observations)
             self.update_targets.copy_statistics()
-            loss, outputs, errors = critic_loss(policy, replay_data, features, targets)
+            loss, q1, errors = critic_loss(policy, replay_data, features, targets[:, :1])
             gradient_step(loss, critic_optimizers, self.max_grad_norm, "critic_loss")
             policy.actor.codebook.project()
             if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
                 assert replay_data.indices is not None, "a prioritised buffer says where its samples are"
                 self.replay_buffer.update_priorities(replay_data.indices, errors)
-            q_mean = policy.value_scale.values(outputs[:, :1]).mean()
-            losses = {"critic_loss": loss, "q_mean": q_mean, "latent_drift": drift}
+            losses = {"critic_loss": loss, "q_mean": policy.value_scale.values(q1).mean(), "latent_drift": drift}
+            features = features.detach()
+            self._learn_rewards(replay_data, features, targets[:, 1:])
 
             if self._n_updates % self.policy_delay == 0:
-                alpha = self.eta / (outputs @ policy.critic.output_weights).abs().mean().clamp(min=1e-6)
-                features = features.detach()
+                with th.no_grad():
+                    (scores,) = policy.critic.weigh((q1,), features, replay_data.latents, replay_data.parameters)
+                alpha = self.eta / scores.abs().mean().clamp(min=1e-6)
 
                 # Step 1: discrete policy, eq. 7
                 parameters = self._parameters_of_latents(replay_data)
@@ -302,7 +304,8 @@ class CHDP(ExploringAlgorithm):
     def _update_learning_rates(self) -> None:
         """Set the learning rates of all optimizers according to their schedules."""
         policy = self.policy
-        self._update_learning_rate([policy.critic.optimizer, policy.discrete_optimizer, policy.continuous_optimizer])
+        optimizers = [policy.critic.optimizer, policy.discrete_optimizer, policy.continuous_optimizer]
+        self._update_learning_rate(optimizers + ([] if policy.reward_optimizer is None else [policy.reward_optimizer]))
         rate = self.codebook_lr_factor * self.lr_schedule(self._current_progress_remaining)
         update_learning_rate(policy.codebook_optimizer, rate)
         self.logger.record("train/codebook_learning_rate", rate)
@@ -318,4 +321,6 @@ class CHDP(ExploringAlgorithm):
             "policy.continuous_optimizer",
             "policy.codebook_optimizer",
         ]
+        if self.policy.reward_optimizer is not None:
+            optimizers.append("policy.reward_optimizer")
         return ["policy", *optimizers], []

@@ -1,4 +1,4 @@
-"""The twin critic of CHDP."""
+"""The twin critic of CHDP, and a network of the reward alone."""
 
 from typing import Any
 
@@ -41,16 +41,16 @@ class AttentionReads(nn.Module):
 
 
 def value_mlp(n_inputs: int, net_arch: list[int], activation_fn: type[nn.Module]) -> nn.Sequential:
-    """:return: MLP with two outputs, and layer normalisation before the activation of its last hidden layer"""
+    """:return: MLP with one output, and layer normalisation before the activation of its last hidden layer"""
     layers = create_mlp(n_inputs, -1, net_arch, activation_fn)
     if net_arch:
         layers.insert(-1, nn.LayerNorm(net_arch[-1]))
-    return nn.Sequential(*layers, nn.Linear([n_inputs, *net_arch][-1], 2))
+    return nn.Sequential(*layers, nn.Linear([n_inputs, *net_arch][-1], 1))
 
 
 class QNetwork(nn.Module):
     """
-    Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a, and the reward of the step in the same form.
+    Q(s, e, a) = V(s) + A(s, e, a) for the latent e and the parameters a.
 
     The last hidden layers are normalised, which bounds Q where there is no data (Ball et al., 2023), not the ones before,
     which would lose how large their inputs are.
@@ -84,38 +84,37 @@ class QNetwork(nn.Module):
         self.advantage = value_mlp(n_inputs, net_arch, activation_fn)
 
     def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-        """:return: (B, 2) values and expected rewards"""
+        """:return: (B, 1) values"""
         products = (latents[:, :, None] * parameters[:, None]).flatten(1)
         x = th.cat([features, parameters, latents, self.reads(features, latents), products], dim=1)
         return self.value(features) + self.advantage(x)
 
     @th.no_grad()
-    def rescale(self, factor: th.Tensor, summands: th.Tensor) -> None:
-        """Multiply the outputs by a factor and add a number to each."""
+    def rescale(self, factor: th.Tensor, summand: th.Tensor) -> None:
+        """Multiply the values by a factor and add a number."""
         for parameter in (*self.value[-1].parameters(), *self.advantage[-1].parameters()):
             parameter.mul_(factor)
         *_, bias = self.value[-1].parameters()
-        bias.add_(summands)
+        bias.add_(summand)
 
 
 class HybridCritic(BaseModel):
     """
     Twin critic Q(s, latent, parameters), with the features of the state computed once for several calls.
 
-    Its networks put out Q, and where there is a second output, the reward of the step: what decides between actions is then a
-    weighted mean of both.
-
     :param observation_space: observation space
     :param action_space: space of the action rows
     :param features_extractor: network to extract features
     :param q_networks: two networks of features, latents and parameters
-    :param n_outputs: number of their outputs, 1 or 2
+    :param reward_network: such a network of the reward alone, for foresight below 1; None: foresight is always 1
     :param normalize_images: whether to divide images by 255
+
+    :ivar foresight: weight in [0, 1] of what follows a reward in the choice of actions
     """
 
     features_extractor: BaseFeaturesExtractor
     optimizer: th.optim.Optimizer
-    output_weights: th.Tensor
+    reward_network: nn.Module | None
 
     def __init__(
         self,
@@ -123,41 +122,57 @@ class HybridCritic(BaseModel):
         action_space: spaces.Box,
         features_extractor: BaseFeaturesExtractor,
         q_networks: list[nn.Module],
-        n_outputs: int,
+        reward_network: nn.Module | None = None,
         normalize_images: bool = True,
     ):
         super().__init__(
             observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
         )
         self.q_networks = nn.ModuleList(q_networks)
-        self.register_buffer("output_weights", th.eye(n_outputs, 1))
+        self.reward_network = reward_network
+        self.foresight = 1.0
 
     def features(self, obs: PyTorchObs) -> th.Tensor:
         """:return: (B, features_dim) features of the observations"""
         return self.extract_features(obs, self.features_extractor)
 
-    def outputs(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> list[th.Tensor]:
+    def q_values(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         :param features: (B, features_dim) from :meth:`features`
         :param latents: (B, latent_dim)
         :param parameters: (B, n_parameters) scaled parameters
-        :return: those of both networks, each (B, n_outputs), in the units of :class:`ValueScale`
+        :return: Q1 and Q2, each (B, 1), in the units of :class:`ValueScale`
         """
-        return [q_net(features, latents, parameters) for q_net in self.q_networks]
-
-    def q_values(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """
-        :return: what decides between actions, by either network, each (B, 1); see :meth:`outputs`
-        """
-        q1, q2 = (outputs @ self.output_weights for outputs in self.outputs(features, latents, parameters))
+        q1, q2 = (q_net(features, latents, parameters) for q_net in self.q_networks)
         return q1, q2
 
-    def q1_values(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-        """:return: (B, 1) the first of :meth:`q_values` alone"""
-        return self.q_networks[0](features, latents, parameters) @ self.output_weights
+    def scores(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> tuple[th.Tensor, ...]:
+        """
+        :return: what decides between actions, each (B, 1): :meth:`q_values`, with what follows the reward weighted
+        """
+        return self.weigh(self.q_values(features, latents, parameters), features, latents, parameters)
+
+    def score1(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+        """:return: (B, 1) the first of :meth:`scores` alone"""
+        return self.weigh((self.q_networks[0](features, latents, parameters),), features, latents, parameters)[0]
+
+    def weigh(
+        self, q_values: tuple[th.Tensor, ...], features: th.Tensor, latents: th.Tensor, parameters: th.Tensor
+    ) -> tuple[th.Tensor, ...]:
+        """:return: r + foresight (Q - r) for each of the values, r from the reward network"""
+        if self.foresight == 1 or self.reward_network is None:
+            return q_values
+        rewards = self.reward_network(features, latents, parameters)
+        return tuple(th.lerp(rewards, q, self.foresight) for q in q_values)
 
     def rescale(self, factor: th.Tensor, summands: th.Tensor) -> None:
-        """Multiply the outputs by a factor and add a number to each."""
-        for q_net in self.q_networks:
-            assert isinstance(q_net, QNetwork)
-            q_net.rescale(factor, summands)
+        """Multiply the outputs by a factor and add numbers to values and rewards."""
+        for network, summand in zip([*self.q_networks, self.reward_network], summands[[0, 0, 1]], strict=True):
+            assert isinstance(network, QNetwork)
+            network.rescale(factor, summand)
+
+    def get_extra_state(self) -> th.Tensor:
+        return th.tensor(self.foresight)
+
+    def set_extra_state(self, state: th.Tensor) -> None:
+        self.foresight = state.item()

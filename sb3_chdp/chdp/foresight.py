@@ -1,8 +1,9 @@
 """
 How far CHDP trusts what its critics say about the future: where actions have no influence on it, that is noise.
 
-The critics learn rewards beside values: the difference is what follows. Exploratory actions are random draws, so that only
-their effect tells what comes of one from what comes of others: what the critics claim of it can be compared with what did.
+Beside the critics a network learns the rewards: the difference is what follows. Exploratory actions are random draws, so that
+only their effect tells what comes of one from what comes of others: what the networks claim of it can be compared with what
+did.
 """
 
 from typing import NamedTuple
@@ -77,10 +78,13 @@ class ForesightSums(NamedTuple):
 
 
 def expected_outcomes(policy: CHDPPolicy, features: th.Tensor, rows: np.ndarray) -> th.Tensor:
-    """:return: (n, 2) values and rewards that the target critics expect of actions, mean of both, in the critics' units"""
+    """:return: (n, 2) values and rewards that the target networks expect of actions, in the critics' units"""
     columns, actions = policy.action_space.columns, th.as_tensor(rows, device=policy.device)
     latents, parameters = columns.view(actions, "latents"), columns.view(actions, "parameters")
-    return th.stack(policy.critic_target.outputs(features, latents, parameters)).mean(dim=0)
+    critic = policy.critic_target
+    assert critic.reward_network is not None, "PaperCHDP does not explore"
+    values = th.stack(critic.q_values(features, latents, parameters)).mean(dim=0)
+    return th.cat([values, critic.reward_network(features, latents, parameters)], dim=1)
 
 
 @th.no_grad()

@@ -2,6 +2,7 @@
 
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
+from torch.nn import functional as F
 
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.samples import HybridReplaySamples
@@ -37,8 +38,8 @@ def next_values(policy: CHDPPolicy, observations: PyTorchObs, masks: th.Tensor |
     """
     features = policy.critic_target.features(observations)
     latents, _, parameters = policy.select_target(policy.actor_target, policy.critic, features, masks=masks)
-    q1, q2 = policy.critic_target.outputs(features, latents, parameters)
-    return policy.value_scale.values(th.min(q1[:, :1], q2[:, :1]))
+    q1, q2 = policy.critic_target.q_values(features, latents, parameters)
+    return policy.value_scale.values(th.min(q1, q2))
 
 
 @th.no_grad()
@@ -59,24 +60,37 @@ def critic_loss(
     policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, targets: th.Tensor
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """
-    Eq. 10, (Q_j(s, e, a) - y)^2, and the same for the reward alone, weighted if the replay is prioritised.
+    Eq. 10, (Q_j(s, e, a) - y)^2, weighted if the replay is prioritised.
 
     It has a gradient for the codebook, which may be used.
 
     :param policy: the networks
     :param replay_data: a batch
     :param features: (B, features_dim) features of the observations
-    :param targets: (B, n_outputs) targets in the units of the critics
-    :return: sum over both critics, the detached (B, n_outputs) outputs of the first, and the larger (B,) of both absolute
-        errors of values
+    :param targets: (B, 1) targets y in the units of the critics
+    :return: sum over both critics, the detached (B, 1) values of the first, and the larger (B,) absolute error of both
     """
     # The gradient with respect to a latent is also that of its codeword, as if the one moved with the other
     codewords = policy.actor.codebook(replay_data.discrete_actions)
     latents = replay_data.latents + (codewords - codewords.detach())
-    outputs = th.stack(policy.critic.outputs(features, latents, replay_data.parameters), dim=1)
-    errors = outputs - targets[:, None]
-    loss = (replay_data.weights * (errors.square() @ policy.value_scale.loss_weights)).sum(dim=1).mean()
-    return loss, outputs[:, 0].detach(), errors.detach()[:, :, 0].abs().amax(dim=1)
+    q_values = th.cat(policy.critic.q_values(features, latents, replay_data.parameters), dim=1)
+    errors = q_values - targets
+    loss = (replay_data.weights * errors.square()).sum(dim=1).mean()
+    return loss, q_values[:, :1].detach(), errors.detach().abs().amax(dim=1)
+
+
+def reward_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, targets: th.Tensor) -> th.Tensor:
+    """
+    Squared error of the reward network.
+
+    :param policy: the networks
+    :param replay_data: a batch
+    :param features: (B, features_dim) features of the observations, without gradient
+    :param targets: (B, 1) rewards in the units of the critics
+    """
+    assert policy.critic.reward_network is not None, "PaperCHDP has none"
+    rewards = policy.critic.reward_network(features, replay_data.latents, replay_data.parameters)
+    return F.mse_loss(rewards, targets)
 
 
 def discrete_policy_loss(
@@ -97,7 +111,7 @@ def discrete_policy_loss(
         with th.no_grad():
             parameters = actor.sample_parameters(features, actor.codebook.quantize(latents, replay_data.masks))
     diffusion_loss = actor.discrete_policy.diffusion_loss(replay_data.latents, features)
-    return diffusion_loss, -policy.critic.q1_values(features, latents, parameters).mean()
+    return diffusion_loss, -policy.critic.score1(features, latents, parameters).mean()
 
 
 def continuous_policy_loss(
@@ -118,4 +132,4 @@ def continuous_policy_loss(
     condition = actor.condition(features, actor.codebook(stored_k).detach())
     diffusion_loss = actor.continuous_policy.diffusion_loss(replay_data.parameters, condition, actor.mask(stored_k))
     parameters = actor.sample_parameters(features, k)
-    return diffusion_loss, -policy.critic.q1_values(features, latents, parameters).mean()
+    return diffusion_loss, -policy.critic.score1(features, latents, parameters).mean()

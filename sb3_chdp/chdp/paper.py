@@ -53,10 +53,9 @@ class PaperPolicy(CHDPPolicy):
         n_inputs = extractor.features_dim + self.action_space.latent_dim + self.action_space.spec.max_parameters
         critic_arch = get_actor_critic_arch(self.net_arch)[1]
         q_networks: list[nn.Module] = [PaperQNetwork(n_inputs, critic_arch, self.activation_fn) for _ in range(2)]
-        return HybridCritic(self.observation_space, self.action_space, extractor, q_networks, 1, self.normalize_images)
-
-    def in_units_of_critics(self, targets: th.Tensor) -> th.Tensor:
-        return targets[:, :1]
+        return HybridCritic(
+            self.observation_space, self.action_space, extractor, q_networks, normalize_images=self.normalize_images
+        )
 
     def _make_selections(self) -> tuple[Selection, Selection, Selection]:
         one = Selection(n_drawn=1)

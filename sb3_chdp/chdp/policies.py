@@ -109,14 +109,17 @@ class CHDPPolicy(HybridPolicy):
         for target in (self.actor_target, self.critic_target):
             target.requires_grad_(False)
             target.train(False)
-        self.value_scale = ValueScale(len(self.critic.output_weights), self.adapts_values)
+        self.value_scale = ValueScale(self.adapts_values)
         self.select, self.select_deterministic, self.select_target = self._make_selections()
 
         actor = self.actor
         self.discrete_optimizer = self._make_optimizer(actor.discrete_policy, lr_schedule)
         continuous = nn.ModuleList([actor.continuous_policy, *([] if actor.reads is None else [actor.reads])])
         self.continuous_optimizer = self._make_optimizer(continuous, lr_schedule)
-        self.critic.optimizer = self._make_optimizer(self.critic, lr_schedule)
+        value_networks = nn.ModuleList([self.critic.features_extractor, self.critic.q_networks])
+        self.critic.optimizer = self._make_optimizer(value_networks, lr_schedule)
+        rewards = self.critic.reward_network
+        self.reward_optimizer = None if rewards is None else self._make_optimizer(rewards, lr_schedule)
         self.codebook_optimizer = self._make_optimizer(actor.codebook, lr_schedule)
 
         # Random actions of deterministic predictions, the same for every model
@@ -128,11 +131,11 @@ class CHDPPolicy(HybridPolicy):
     def _make_critic(self, extractor: BaseFeaturesExtractor) -> HybridCritic:
         latent_dim, n_parameters = self.action_space.latent_dim, self.action_space.spec.max_parameters
         critic_arch = get_actor_critic_arch(self.net_arch)[1]
-        q_networks: list[nn.Module] = [
+        q1, q2, rewards = (
             QNetwork(extractor.features_dim, latent_dim, n_parameters, critic_arch, self.activation_fn, self.n_reads)
-            for _ in range(2)
-        ]
-        return HybridCritic(self.observation_space, self.action_space, extractor, q_networks, 2, self.normalize_images)
+            for _ in range(3)
+        )
+        return HybridCritic(self.observation_space, self.action_space, extractor, [q1, q2], rewards, self.normalize_images)
 
     def _make_actor(self, features_dim: int) -> CooperativeActor:
         spec, latent_dim = self.action_space.spec, self.action_space.latent_dim
@@ -229,7 +232,7 @@ class CHDPPolicy(HybridPolicy):
         Adapt the units of the critics to new targets; values stay what they were.
 
         :param targets: (B, 2) values and rewards, in the units of the rewards
-        :return: (B, n_outputs) what the critics ought to put out
+        :return: (B, 2) what the networks ought to put out
         """
         if self.value_scale.adapts and (change := self.value_scale.update(targets)) is not None:
             for critic in (self.critic, self.critic_target):
@@ -241,7 +244,7 @@ class CHDPPolicy(HybridPolicy):
         :param weight: weight in [0, 1] of what follows a reward in the choice of actions, see :class:`ForesightSums`
         """
         for critic in (self.critic, self.critic_target):
-            critic.output_weights[0], critic.output_weights[1:] = weight, 1 - weight
+            critic.foresight = weight
 
     def set_training_mode(self, mode: bool) -> None:
         """

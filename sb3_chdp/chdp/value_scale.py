@@ -12,11 +12,10 @@ MAX_OUTPUT = 20.0
 
 class ValueScale(nn.Module):
     """
-    What an output of the critics stands for is ``center + scale * output``: the mean of its targets so far, and the standard
-    deviation of those of the first, the values. When these change, the critics' last layers do as well, so that values stay
+    What networks of values and of rewards put out stands for ``center + scale * output``: the mean of their targets so far, and
+    the standard deviation of the values. When these change, the critics' last layers do as well, so that values stay
     (PopArt, van Hasselt et al., 2016). At first all values are 0, whatever the critics put out.
 
-    :param n_outputs: number of outputs
     :param adapts: False: values are what the critics put out, for ever
     """
 
@@ -24,34 +23,29 @@ class ValueScale(nn.Module):
     variance: th.Tensor
     n_batches: th.Tensor
 
-    def __init__(self, n_outputs: int, adapts: bool = True) -> None:
+    def __init__(self, adapts: bool = True) -> None:
         super().__init__()
         self.adapts = adapts
-        for name, shape in (("center", (n_outputs,)), ("variance", (n_outputs,)), ("n_batches", ())):
+        for name, shape in (("center", (2,)), ("variance", ()), ("n_batches", ())):
             self.register_buffer(name, th.zeros(shape, dtype=th.float64))
         self.variance += not adapts
 
     @property
     def scale(self) -> th.Tensor:
         """:return: () difference of values for a difference of 1 in the output"""
-        return self.variance[0].sqrt().clamp(min=MIN_SCALE)
-
-    @property
-    def loss_weights(self) -> th.Tensor:
-        """:return: (n_outputs,) weights of the outputs' squared errors: none counts for more than the values"""
-        return (self.scale.square() / self.variance.clamp(min=MIN_SCALE**2)).clamp(max=1).float()
+        return self.variance.sqrt().clamp(min=MIN_SCALE)
 
     def values(self, outputs: th.Tensor) -> th.Tensor:
         """
-        :param outputs: (B, 1) first outputs of critics
+        :param outputs: (B, 1) what critics put out
         :return: (B, 1) values in the units of the rewards
         """
         return (self.center[0] + self.scale * outputs.double()).float()
 
     def outputs(self, targets: th.Tensor) -> th.Tensor:
         """
-        :param targets: (B, n_outputs) in the units of the rewards
-        :return: (B, n_outputs) what critics put out for them, at most ``MAX_OUTPUT`` from 0 if the scale adapts
+        :param targets: (B, 2) values and rewards, in the units of the rewards
+        :return: (B, 2) what the networks put out for them, at most ``MAX_OUTPUT`` from 0 if the scale adapts
         """
         outputs = ((targets.double() - self.center) / self.scale).float()
         return outputs.clamp(-MAX_OUTPUT, MAX_OUTPUT) if self.adapts else outputs
@@ -59,9 +53,9 @@ class ValueScale(nn.Module):
     @th.no_grad()
     def update(self, targets: th.Tensor) -> tuple[th.Tensor, th.Tensor] | None:
         """
-        :param targets: (B, n_outputs) targets of the critics, in the units of the rewards
-        :return: () factor and (n_outputs,) summands for the critics' outputs, so that the values stay what they were, None if
-            nothing is to change
+        :param targets: (B, 2) values and rewards, in the units of the rewards
+        :return: () factor and (2,) summands for the networks' outputs, so that the values stay what they were, None if nothing
+            is to change
         """
         center, scale = self.center.clone(), self.scale
         if not th.isfinite(targets).all():
@@ -69,8 +63,8 @@ class ValueScale(nn.Module):
         self.n_batches += 1
         weight = (1 / self.n_batches).clamp(min=MIN_UPDATE_WEIGHT)
         shift = targets.double().mean(dim=0) - center
-        variance = targets.double().var(dim=0, correction=0)
-        self.variance.lerp_(variance + (1 - weight) * shift.square(), weight)
+        variance = targets[:, 0].double().var(correction=0)
+        self.variance.lerp_(variance + (1 - weight) * shift[0].square(), weight)
         self.center += weight * shift
         if scale <= MIN_SCALE:
             return None
