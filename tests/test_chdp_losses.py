@@ -4,6 +4,7 @@ import itertools
 
 import pytest
 import torch as th
+from torch.nn import functional as F
 
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import PaperCHDP, losses
@@ -36,7 +37,7 @@ def all_losses(model, parameters="drawn"):
     data, policy = sample(model), model.policy
     features = policy.critic.features(data.observations)
     targets = policy.in_units_of_critics(losses.target_values(policy, data))
-    critic, *_ = losses.critic_loss(policy, data, features, targets)
+    critic, *_ = losses.critic_loss(policy, data, features, targets[:, :1])
     features = features.detach()
     stored = data.parameters if parameters == "stored" else None
     discrete = losses.discrete_policy_loss(policy, data, features, stored)
@@ -175,24 +176,33 @@ def test_next_values_are_whole_without_foresight():
 
 @BOTH
 def test_critic_loss(algorithm_class):
-    """The sum of all squared errors, weighted; priorities follow the larger error of both critics."""
+    """The sum of both squared errors, weighted; priorities follow the larger error of both critics."""
     model = filled_model(algorithm_class=algorithm_class)
-    data, n_outputs = sample(model), len(model.critic.output_weights)
-    targets, features = th.randn(32, n_outputs), model.critic.features(data.observations)
-    # Rewards vary twice as much as values
-    squares = th.tensor([1.0, 4.0][:n_outputs])
-    model.policy.value_scale.variance.copy_(squares)
-    q1, q2 = model.critic.outputs(features, data.latents, data.parameters)
-    loss, outputs, errors = losses.critic_loss(model.policy, data._replace(weights=1.0), features, targets)
-    of_rows = sum(((q - targets) ** 2 / squares).sum(dim=1) for q in (q1, q2))
-    th.testing.assert_close(loss, of_rows.mean())
-    th.testing.assert_close(outputs, q1.detach())
-    expected = th.stack([(q - targets)[:, 0].abs() for q in (q1, q2)]).amax(dim=0)
-    th.testing.assert_close(errors, expected.detach())
+    data, targets = sample(model), th.randn(32, 1)
+    features = model.critic.features(data.observations)
+    q1, q2 = model.critic.q_values(features, data.latents, data.parameters)
+    loss, values, errors = losses.critic_loss(model.policy, data._replace(weights=1.0), features, targets)
+    th.testing.assert_close(loss, F.mse_loss(q1, targets) + F.mse_loss(q2, targets))
+    th.testing.assert_close(values, q1.detach())
+    th.testing.assert_close(errors, th.cat([(q - targets).abs() for q in (q1, q2)], dim=1).amax(dim=1).detach())
     one = th.zeros(32, 1)
     one[3] = 1.0
     weighted, *_ = losses.critic_loss(model.policy, data._replace(weights=one), features, targets)
-    th.testing.assert_close(weighted, of_rows[3] / 32)
+    th.testing.assert_close(weighted, ((q1[3] - targets[3]) ** 2 + (q2[3] - targets[3]) ** 2).squeeze() / 32)
+
+
+def test_rewards_are_learnt_beside():
+    """By a network and an optimizer of their own, which move nothing else."""
+    model = filled_model()
+    data, targets, critic = sample(model), th.randn(32, 1), model.critic
+    features = critic.features(data.observations).detach()
+    loss = losses.reward_loss(model.policy, data, features, targets)
+    th.testing.assert_close(loss, F.mse_loss(critic.reward_network(features, data.latents, data.parameters), targets))
+    before = {name: p.detach().clone() for name, p in model.policy.named_parameters()}
+    model._learn_rewards(data, features, targets)
+    moved = {name for name, p in model.policy.named_parameters() if (p != before[name]).any()}
+    assert moved and all(name.startswith("critic.reward_network.") for name in moved)
+    assert losses.reward_loss(model.policy, data, features, targets) < loss
 
 
 def test_alpha_normalises_by_q():

@@ -79,9 +79,10 @@ def test_what_decides_between_actions(foresight):
     for critic in (model.critic, model.critic_target):
         features = critic.features(data.observations)
         inputs = (features, data.latents, data.parameters)
-        expected = [foresight * q[:, :1] + (1 - foresight) * q[:, 1:] for q in critic.outputs(*inputs)]
-        th.testing.assert_close(list(critic.q_values(*inputs)), expected)
-        th.testing.assert_close(critic.q1_values(*inputs), expected[0])
+        rewards = critic.reward_network(*inputs)
+        expected = [foresight * q + (1 - foresight) * rewards for q in critic.q_values(*inputs)]
+        th.testing.assert_close(list(critic.scores(*inputs)), expected)
+        th.testing.assert_close(critic.score1(*inputs), expected[0])
 
 
 class Pairs(gym.Env):
@@ -116,7 +117,7 @@ def test_claims_come_true_where_actions_have_influence():
         model = fast_model(env=Pairs(random), learning_starts=100, gamma=0.9, train_freq=2, batch_size=64).learn(800)
         sums.append(model.foresight_sums)
         for critic in (model.critic, model.critic_target):
-            assert critic.output_weights[0].item() == pytest.approx(model.foresight_sums.weight())
+            assert critic.foresight == model.foresight_sums.weight()
     assert sums[1].fy / sums[1].ff > 0.5 and sums[1].weight() == 1
     assert abs(sums[0].fy) < 0.2 * sums[1].fy
 
@@ -131,7 +132,7 @@ def test_it_is_saved(tmp_path):
     loaded = CHDP.load(tmp_path / "model", env=Pairs(False))
     assert ForesightSums(*loaded.foresight_sums) == model.foresight_sums
     for critic in (loaded.critic, loaded.critic_target):
-        assert critic.output_weights.tolist() == [[0.25], [0.75]] == model.critic.output_weights.tolist()
+        assert critic.foresight == 0.25
     loaded.learn(30, reset_num_timesteps=False)
 
 
@@ -158,4 +159,4 @@ def test_masks_and_several_environments():
 def test_the_paper_looks_ahead():
     model = fast_model(PaperCHDP, learning_starts=10)
     model.learn(40)
-    assert model.critic.output_weights.tolist() == [[1.0]] and model.foresight_sums == ForesightSums()
+    assert model.critic.foresight == 1 and model.foresight_sums == ForesightSums()

@@ -1,6 +1,6 @@
 """What CHDP does to explore, and what it learns about itself from that."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -28,6 +28,7 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
     """
 
     policy: CHDPPolicy
+    max_grad_norm: ClassVar[float | None]
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
@@ -63,7 +64,7 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         """One gradient step of the network of the rewards, if there is one."""
         if self.policy.reward_optimizer is not None:
             loss = reward_loss(self.policy, replay_data, features, targets)
-            gradient_step(loss, [self.policy.reward_optimizer], name="reward_loss")
+            gradient_step(loss, [self.policy.reward_optimizer], self.max_grad_norm, "reward_loss")
 
     def _count_returns(self, replay_buffer: ReplayBuffer) -> None:
         # As the environment gave them, within VecNormalize too

@@ -12,9 +12,9 @@ MAX_OUTPUT = 20.0
 
 class ValueScale(nn.Module):
     """
-    What networks of values and of rewards put out stands for ``center + scale * output``: the mean of their targets so far, and
-    the standard deviation of the values. When these change, the critics' last layers do as well, so that values stay
-    (PopArt, van Hasselt et al., 2016). At first all values are 0, whatever the critics put out.
+    What networks of values and rewards put out stands for ``center + scale * output``: the mean of their targets so far, and
+    the standard deviation of the values. When these change, the networks' last layers do as well, so that values stay (PopArt,
+    van Hasselt et al., 2016). At first all values are 0, whatever the critics put out.
 
     :param adapts: False: values are what the critics put out, for ever
     """
