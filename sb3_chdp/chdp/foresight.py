@@ -20,7 +20,7 @@ N_OTHERS = 16
 # About so many of the latest claims count; with fewer than that at first nobody knows
 N_REMEMBERED, MIN_CLAIMS = 500, 10
 # Standard errors by which the benefit of the doubt exceeds the estimate
-N_ERRORS = 2.0
+N_ERRORS = 1.0
 
 
 class Claims(NamedTuple):
