@@ -87,9 +87,7 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         masks = self._action_masks()
         next_masks = None if masks is None else th.as_tensor(masks, device=self.device)
         values = next_values(self.policy, self.policy.obs_to_tensor(new_obs)[0], next_masks)
-        came = th.as_tensor(rewards, device=self.device) + self.gamma * values[:, 0] * th.as_tensor(
-            1 - dones, device=self.device
-        )
+        came = th.as_tensor(rewards + self.gamma * (1 - dones) * values.flatten().cpu().numpy(), device=self.device)
         outputs = self.policy.value_scale.outputs(th.stack([came, came], dim=1))[:, 0].tolist()
         sums = ForesightSums(*self.foresight_sums)  # a list in a loaded model
         for i, reward, follows, expected in zip(claims.envs, claims.rewards, claims.follows, claims.expected, strict=True):
