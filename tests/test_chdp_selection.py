@@ -25,7 +25,7 @@ class Critic:
     def __init__(self, q1, q2=None):
         self.q1, self.q2, self.asked = q1, q2 or q1, []
 
-    def q_values(self, features, latents, parameters):
+    def scores(self, features, latents, parameters):
         assert len(features) == len(latents) == len(parameters)
         q1, q2 = self.q1(features, latents, parameters), self.q2(features, latents, parameters)
         self.asked.append((features, latents, parameters, th.min(q1, q2)))
@@ -193,7 +193,7 @@ def test_predictions_are_the_best_candidates(deterministic):
     columns, q_networks = model.hybrid_space.columns, model.critic_target.q_networks
     calls, outputs = calls_of(q_networks[0]), [[], []]
     for network, values in zip(q_networks, outputs, strict=True):
-        network.register_forward_hook(lambda module, args, parts, values=values: values.append(parts.detach().sum(dim=1)))
+        network.register_forward_hook(lambda module, args, q, values=values: values.append(q.detach()))
     rows = model.policy.predict_rows(obs, deterministic)
     best = th.min(outputs[0][0], outputs[1][0]).view(6, -1).argmax(dim=1)
     # Deterministic ones are refined: what the parameters are near to

@@ -89,11 +89,12 @@ def test_time_limits_bootstrap_and_terminations_do_not(episode_end, bootstraps):
 def test_the_learning_rate_falls_to_zero_by_default():
     model = CHDP("MlpPolicy", HybridIdentityEnv(), learning_starts=0, codebook_lr_factor=0.5, seed=0, n_diffusion_steps=1)
     policy, rates = model.policy, []
-    optimizers = (policy.critic.optimizer, policy.discrete_optimizer, policy.continuous_optimizer, policy.codebook_optimizer)
+    of_networks = (policy.critic.optimizer, policy.reward_optimizer, policy.discrete_optimizer, policy.continuous_optimizer)
+    optimizers = (*of_networks, policy.codebook_optimizer)
     # The callback comes before the training of its step
     model.learn(21, callback=lambda *_: rates.append([o.param_groups[0]["lr"] for o in optimizers]) is None)
     rates = np.array(rates)[1:]
-    np.testing.assert_allclose(rates / rates[:, :1], [[1, 1, 1, 0.5]] * len(rates))
+    np.testing.assert_allclose(rates / rates[:, :1], [[1, 1, 1, 1, 0.5]] * len(rates))
     np.testing.assert_allclose(np.diff(rates[:, 0]), -rates[0, 0] / len(rates), rtol=1e-6)
 
 
@@ -145,8 +146,8 @@ def test_logged_values():
     logged = model.logger.name_to_value
     names = {name.removeprefix("train/") for name in logged if name.startswith("train/")}
     assert names >= {
-        "critic_loss", "discrete_loss", "continuous_loss", "diffusion_loss_discrete", "diffusion_loss_continuous", "q_mean",
-        "codebook_usage", "codebook_perplexity", "latent_drift", "learning_rate", "codebook_learning_rate", "n_updates",
+        "critic_loss", "reward_loss", "discrete_loss", "continuous_loss", "diffusion_loss_discrete", "diffusion_loss_continuous",
+        "q_mean", "codebook_usage", "codebook_perplexity", "latent_drift", "learning_rate", "codebook_learning_rate", "n_updates",
     }  # fmt: skip
     assert 1 <= logged["train/codebook_perplexity"] <= 3
     assert 0 < logged["train/codebook_usage"] <= 1
@@ -167,7 +168,9 @@ def test_padding_reaches_nothing():
     """Rows, replay buffer and critic see 0 for parameters that the action does not have."""
     model = filled_model(make_layout_env("nested"), policy_delay=1, learning_rate=0.0)
     mask, columns = model.hybrid_space.spec.mask.astype(bool), model.hybrid_space.columns
-    calls = [calls_of(q_network) for q_network in (*model.critic.q_networks, *model.critic_target.q_networks)]
+    model.policy.set_foresight(0.5)
+    critics = (model.critic, model.critic_target)
+    calls = [calls_of(network) for critic in critics for network in (*critic.q_networks, critic.reward_network)]
     model.train(2, 32)
     rows = model.policy.predict_rows(np.random.uniform(-1, 1, (200, 2)).astype(np.float32))
     assert all(calls)

@@ -124,7 +124,7 @@ def test_claims_come_true_where_actions_have_influence():
 
 def test_it_is_saved(tmp_path):
     model = fast_model(env=Pairs(False))
-    model.policy.set_foresight(0.25)
+    model.policy.set_foresight(0.3)
     model.foresight_sums = ForesightSums(50.0, 1.0, 0.0, 1.0, 1.0, 0.1, 2.0)
     # Saves between an exploratory action and what follows it
     model.learn(30, CheckpointCallback(10, str(tmp_path)))
@@ -132,7 +132,7 @@ def test_it_is_saved(tmp_path):
     loaded = CHDP.load(tmp_path / "model", env=Pairs(False))
     assert ForesightSums(*loaded.foresight_sums) == model.foresight_sums
     for critic in (loaded.critic, loaded.critic_target):
-        assert critic.foresight == 0.25
+        assert critic.foresight == 0.3
     loaded.learn(30, reset_num_timesteps=False)
 
 

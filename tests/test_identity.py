@@ -52,8 +52,9 @@ def test_broken_chdp_fails(broken):
     settings = dict(SETTINGS[algorithm], eta=eta)
     model = algorithm("MlpPolicy", make_vec_env(HybridIdentityEnv, 8, seed=0), seed=0, gamma=0.0, **settings)
     if broken == "critics ignore the latents":
-        for q_net in (*model.critic.q_networks, *model.critic_target.q_networks):
-            q_net.register_forward_pre_hook(lambda _, args: (args[0], th.zeros_like(args[1]), args[2]))
+        for critic in (model.critic, model.critic_target):
+            for network in (*critic.q_networks, critic.reward_network):
+                network.register_forward_pre_hook(lambda _, args: (args[0], th.zeros_like(args[1]), args[2]))
     model.learn(5000)
     assert success(model) < THRESHOLD - 0.2
 

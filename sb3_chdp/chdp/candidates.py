@@ -68,7 +68,7 @@ class Candidates(NamedTuple):
         """
         :param critic: twin critic
         :param features: (B, features_dim) features of the observations
-        :return: (B, n) min(Q1, Q2)
+        :return: (B, n) the smaller of both :meth:`HybridCritic.scores`
         """
         n = self.latents.shape[1]
         inputs = features.repeat_interleave(n, dim=0), self.latents.flatten(0, 1), self.parameters.flatten(0, 1)
@@ -79,7 +79,7 @@ class Candidates(NamedTuple):
         :param critic: twin critic
         :param features: (B, features_dim) features of the observations
         :param allowed: (B, n) which candidates may be taken, None: all
-        :return: the candidates of highest min(Q1, Q2) among those that may be taken
+        :return: the candidates of highest :meth:`values` among those that may be taken
         """
         batch_size, n = self.latents.shape[:2]
         latents, k, parameters = (part.flatten(0, 1) for part in self)
@@ -194,7 +194,7 @@ def refined(
 @dataclass(frozen=True)
 class Selection:
     """
-    A rule which actions compete. The one of highest min(Q1, Q2) is taken, and refined if ``n_refined`` is not 0.
+    A rule which actions compete. The one of highest :meth:`Candidates.values` is taken, and refined if ``n_refined`` is not 0.
 
     :param n_drawn: number of actions per observation that both policies draw
     :param n_uniform: number of uniformly random discrete actions with parameters of the continuous policy

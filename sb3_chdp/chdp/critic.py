@@ -172,7 +172,7 @@ class HybridCritic(BaseModel):
             network.rescale(factor, summand)
 
     def get_extra_state(self) -> th.Tensor:
-        return th.tensor(self.foresight)
+        return th.tensor(self.foresight, dtype=th.float64)
 
     def set_extra_state(self, state: th.Tensor) -> None:
         self.foresight = state.item()

@@ -1,6 +1,6 @@
 """What CHDP does to explore, and what it learns about itself from that."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -8,11 +8,9 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 from sb3_chdp.chdp.exploration import ReturnSums, exploration_rate, informative_steps
 from sb3_chdp.chdp.foresight import Claims, ForesightSums, explore
-from sb3_chdp.chdp.losses import next_values, reward_loss
+from sb3_chdp.chdp.losses import next_values
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
-from sb3_chdp.common.samples import HybridReplaySamples
-from sb3_chdp.common.utils import gradient_step
 
 # Claims of critics that have hardly learnt are no matter
 MIN_UPDATES = 200
@@ -28,7 +26,6 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
     """
 
     policy: CHDPPolicy
-    max_grad_norm: ClassVar[float | None]
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
@@ -56,15 +53,9 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         super()._store_transition(replay_buffer, *args)
         _, new_obs, rewards, dones, infos = args
         self._count_returns(replay_buffer)
-        if self._claims is not None and self._n_updates >= MIN_UPDATES and self.n_steps == 1:
+        if self._claims is not None and self._n_updates >= MIN_UPDATES:
             self._check_claims(self._claims, new_obs, rewards, dones, infos)
         self._claims = None
-
-    def _learn_rewards(self, replay_data: HybridReplaySamples, features: th.Tensor, targets: th.Tensor) -> None:
-        """One gradient step of the network of the rewards, if there is one."""
-        if self.policy.reward_optimizer is not None:
-            loss = reward_loss(self.policy, replay_data, features, targets)
-            gradient_step(loss, [self.policy.reward_optimizer], self.max_grad_norm, "reward_loss")
 
     def _count_returns(self, replay_buffer: ReplayBuffer) -> None:
         # As the environment gave them, within VecNormalize too

@@ -2,7 +2,6 @@
 
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
-from torch.nn import functional as F
 
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.samples import HybridReplaySamples
@@ -81,7 +80,7 @@ def critic_loss(
 
 def reward_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, targets: th.Tensor) -> th.Tensor:
     """
-    Squared error of the reward network.
+    Squared error of the reward network, weighted if the replay is prioritised.
 
     :param policy: the networks
     :param replay_data: a batch
@@ -90,7 +89,7 @@ def reward_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, features: 
     """
     assert policy.critic.reward_network is not None, "PaperCHDP has none"
     rewards = policy.critic.reward_network(features, replay_data.latents, replay_data.parameters)
-    return F.mse_loss(rewards, targets)
+    return (replay_data.weights * (rewards - targets).square()).mean()
 
 
 def discrete_policy_loss(

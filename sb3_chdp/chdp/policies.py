@@ -1,4 +1,4 @@
-"""Networks of CHDP: a discrete and a continuous diffusion policy, their codebook, the twin critic and all targets."""
+"""Networks of CHDP: a discrete and a continuous diffusion policy, their codebook, the critics and all targets."""
 
 from copy import deepcopy
 from dataclasses import replace
@@ -47,7 +47,7 @@ class CHDPPolicy(HybridPolicy):
     :param action_space: space of the action rows, with ``latent_dim`` latent columns
     :param lr_schedule: learning rate schedule
     :param net_arch: hidden layers, one list for all networks or ``dict(pi=..., qf=...)`` for the noise predictors and
-        the critics; by default ``dict(pi=[128, 128], qf=[256, 256])``
+        the critics, that of the reward included; by default ``dict(pi=[128, 128], qf=[256, 256])``
     :param activation_fn: activation function
     :param features_extractor_class: features extractor to use; the default normalises observations
     :param features_extractor_kwargs: its keyword arguments
@@ -178,7 +178,7 @@ class CHDPPolicy(HybridPolicy):
         self, observation: PyTorchObs, deterministic: bool = False, action_masks: th.Tensor | None = None
     ) -> th.Tensor:
         """
-        Draw actions and keep the one of highest target min(Q1, Q2), see :class:`Selection`.
+        Draw actions and keep the one that the target critics value most, see :class:`Selection`.
 
         The noise of deterministic predictions is a function of the observation: one and the same noise in all states would
         repeat a policy's mistakes where sampling gets away from them. They use the target policies, averages of the policies
