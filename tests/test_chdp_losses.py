@@ -16,11 +16,13 @@ BOTH = pytest.mark.parametrize("algorithm_class", [CHDP, PaperCHDP])
 def networks(model):
     actor = model.actor
     reads = [] if actor.reads is None else list(actor.reads.parameters())
+    rewards = {} if model.critic.reward_network is None else {"rewards": list(model.critic.reward_network.parameters())}
     return {
         "discrete": list(actor.discrete_policy.parameters()),
         "continuous": [*actor.continuous_policy.parameters(), *reads],
         "codebook": list(actor.codebook.parameters()),
-        "critic": list(model.critic.parameters()),
+        "critic": list(model.critic.q_networks.parameters()),
+        **rewards,
     }
 
 
@@ -98,7 +100,7 @@ def test_each_step_moves_its_own_networks_only(algorithm_class):
         {name for name in after if any((p != q).any() for p, q in zip(after[name], before[name], strict=True))}
         for before, after in itertools.pairwise(states[-4:])
     ]
-    critics_train = {"critic", "codebook"} if algorithm_class is CHDP else {"critic"}
+    critics_train = {"critic", "codebook", "rewards"} if algorithm_class is CHDP else {"critic"}
     assert moved == [critics_train, {"discrete"}, {"continuous", "codebook"}]
 
 
@@ -191,40 +193,12 @@ def test_critic_loss(algorithm_class):
     th.testing.assert_close(weighted, ((q1[3] - targets[3]) ** 2 + (q2[3] - targets[3]) ** 2).squeeze() / 32)
 
 
-def test_rewards_are_learnt_beside():
-    """By a network and an optimizer of their own, which move nothing else."""
+@pytest.mark.parametrize("weight", [1.0, 3.0])
+def test_reward_loss(weight):
     model = filled_model()
-    data, targets, critic = sample(model), th.randn(32, 1), model.critic
+    data, targets, critic = sample(model)._replace(weights=th.full((32, 1), weight)), th.randn(32, 1), model.critic
     features = critic.features(data.observations).detach()
     loss = losses.reward_loss(model.policy, data, features, targets)
-    th.testing.assert_close(loss, F.mse_loss(critic.reward_network(features, data.latents, data.parameters), targets))
-    before = {name: p.detach().clone() for name, p in model.policy.named_parameters()}
-    model._learn_rewards(data, features, targets)
-    moved = {name for name, p in model.policy.named_parameters() if (p != before[name]).any()}
-    assert moved and all(name.startswith("critic.reward_network.") for name in moved)
-    assert losses.reward_loss(model.policy, data, features, targets) < loss
-
-
-def test_alpha_normalises_by_q():
-    """The discrete loss is L_d - eta / mean|Q| * mean Q: however large the values of the critic are."""
-    model = filled_model(learning_rate=0.0, policy_delay=1)
-    for critic in (model.critic, model.critic_target):
-        critic.rescale(th.tensor(1000.0), th.zeros(2))
-    model.train(1, 64)
-    logged = model.logger.name_to_value
-    improvement = logged["train/discrete_loss"] - logged["train/diffusion_loss_discrete"]
-    assert 0 < abs(improvement) < 2 * model.eta
-
-
-def test_relabelling_of_latents():
-    model = filled_model()
-    codebook, data = model.actor.codebook, sample(model, 64)
-    assert (codebook.quantize(data.latents) == data.discrete_actions).all(), "random actions decode to themselves"
-    with th.no_grad():
-        codebook.codewords.neg_()
-    relabelled, drift = losses.relabel_latents(model.policy, data)
-    fits = codebook.quantize(data.latents) == data.discrete_actions
-    assert drift == pytest.approx((~fits).float().mean()) and 0 < drift <= 1
-    assert (codebook.quantize(relabelled.latents) == data.discrete_actions).all()
-    assert (relabelled.latents[fits] == data.latents[fits]).all()
-    assert (relabelled.latents[~fits] == codebook.codewords[data.discrete_actions[~fits]]).all()
+    rewards = critic.reward_network(features, data.latents, data.parameters)
+    th.testing.assert_close(loss, weight * F.mse_loss(rewards, targets))
+    assert networks_with_gradient(model, loss) == {"rewards"}

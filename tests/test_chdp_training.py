@@ -146,8 +146,9 @@ def test_logged_values():
     logged = model.logger.name_to_value
     names = {name.removeprefix("train/") for name in logged if name.startswith("train/")}
     assert names >= {
-        "critic_loss", "reward_loss", "discrete_loss", "continuous_loss", "diffusion_loss_discrete", "diffusion_loss_continuous",
-        "q_mean", "codebook_usage", "codebook_perplexity", "latent_drift", "learning_rate", "codebook_learning_rate", "n_updates",
+        "critic_loss", "reward_loss", "discrete_loss", "continuous_loss", "diffusion_loss_discrete",
+        "diffusion_loss_continuous", "q_mean", "codebook_usage", "codebook_perplexity", "latent_drift", "learning_rate",
+        "codebook_learning_rate", "n_updates",
     }  # fmt: skip
     assert 1 <= logged["train/codebook_perplexity"] <= 3
     assert 0 < logged["train/codebook_usage"] <= 1
