@@ -51,17 +51,19 @@ def test_values_stay_when_the_scale_changes(target):
 
     def values():
         features = critic.features(data.observations)
-        return th.cat(critic.q_values(features, data.latents, data.parameters), dim=1), policy.value_scale.scale.item()
+        inputs = (features, data.latents, data.parameters)
+        outputs, scale = th.cat([*critic.q_values(*inputs), critic.reward_network(*inputs)], dim=1), policy.value_scale.scale
+        # What they stand for: two values and a reward
+        return policy.value_scale.center[[0, 0, 1]] + scale * outputs, scale.item()
 
     policy.set_training_mode(False)
     for factor in (100.0, 0.01):
-        outputs, scale = values()
-        expected = policy.value_scale.values(outputs)
+        expected, scale = values()
         for _ in range(20):
             policy.in_units_of_critics(factor * th.randn(32, 2))
-        outputs, new_scale = values()
+        present, new_scale = values()
         assert abs(np.log(new_scale / scale)) > 0.1
-        th.testing.assert_close(policy.value_scale.values(outputs), expected, rtol=1e-4, atol=1e-4)
+        th.testing.assert_close(present, expected, rtol=1e-4, atol=1e-4)
 
 
 class Units(HybridIdentityEnv):

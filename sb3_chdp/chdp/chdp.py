@@ -51,7 +51,7 @@ class CHDP(ExploringAlgorithm):
         2. critics have layer normalisation, a state value of their own and read parts of the state, see :class:`QNetwork`;
         3. the critics' loss trains the codebook too, so that actions of similar effect get similar codewords; latents from
            the buffer that no longer decode to the action taken give way to its present codeword, see ``train/latent_drift``;
-        4. of several actions the one of highest score acts, and is the next action in targets, see :class:`Selection`;
+        4. of several actions the one that critics value most acts, and is the next action in targets, see :class:`Selection`;
         5. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
            stored ones, and the continuous policy for uniformly random discrete actions too;
         6. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate`,
@@ -239,6 +239,7 @@ class CHDP(ExploringAlgorithm):
                 self.replay_buffer.update_priorities(replay_data.indices, errors)
             losses = {"critic_loss": loss, "q_mean": policy.value_scale.values(q1).mean(), "latent_drift": drift}
             features = features.detach()
+            # The reward alone, for foresight; PaperCHDP has none
             if policy.reward_optimizer is not None:
                 loss = reward_loss(policy, replay_data, features, targets[:, 1:])
                 gradient_step(loss, [policy.reward_optimizer], self.max_grad_norm, "reward_loss")
