@@ -3,6 +3,7 @@ Speed, as medians over repeats in one process on one thread; the results replace
 
     make speed                                        all tables
     python benchmarks/speed.py --tables step loop     some of them, printed only
+    python benchmarks/speed.py --device cuda          what a GPU changes, printed only
 
 Ratios compare what ran side by side, turn by turn. Only the original environments were measured elsewhere (AMD EPYC, 2
 vCPUs, Python 3.11.7): read those ratios as orders of magnitude.
@@ -111,7 +112,7 @@ def conversion(repeats: int) -> Iterator[str]:
         yield f"| {name} | {seconds / 8 * 1e6:.0f} |"
 
 
-def step(repeats: int) -> Iterator[str]:
+def step(repeats: int, device: str) -> Iterator[str]:
     """(a) gradient step against SB3's TD3, all with batches of 128; TD3 on the flattened environment, 2 x 256"""
     cases: list[tuple[str, type[BaseAlgorithm], int, dict[str, Any]]] = [
         # Every other step of TD3 updates its policy
@@ -120,7 +121,7 @@ def step(repeats: int) -> Iterator[str]:
         ("CHDP, 2 x 256", CHDP, 2, dict(policy_kwargs=BIG)),
         ("PaperCHDP", PaperCHDP, 1, {}),
     ]
-    models = [build(algorithm, **kwargs) for _, algorithm, _, kwargs in cases]
+    models = [build(algorithm, device=device, **kwargs) for _, algorithm, _, kwargs in cases]
     seconds = medians([lambda m=m, n=case[2]: m.train(n, 128) for m, case in zip(models, cases, strict=True)], repeats)
     per_step = [value / case[2] for value, case in zip(seconds, cases, strict=True)]
     yield "| gradient step | ratio to TD3 | milliseconds |\n|---|---|---|"
@@ -155,10 +156,11 @@ def matrix_products(repeats: int) -> Iterator[str]:
         yield f"| {label} | {1e3 * whole:.1f} | {1e3 * floor:.1f} | {whole / floor:.1f} |"
 
 
-def predict(repeats: int) -> Iterator[str]:
+def predict(repeats: int, device: str) -> Iterator[str]:
     """(c) acting: CHDP chooses among candidates, and refines its choice in deterministic predictions"""
     yield "| observations | CHDP, ms | CHDP, deterministic, ms | PaperCHDP, ms | SB3's TD3, ms |\n|---|---|---|---|---|"
-    chdp, paper, td3 = build(CHDP), build(PaperCHDP), build(TD3, wrapper=FlattenHybridAction)
+    chdp, paper = build(CHDP, device=device), build(PaperCHDP, device=device)
+    td3 = build(TD3, wrapper=FlattenHybridAction, device=device)
     cases = [(chdp, False), (chdp, True), (paper, True), (td3, True)]
     for n in (1, 8, 64):
         obs = np.random.default_rng(0).uniform(-1, 1, (n, 4)).astype(np.float32)
@@ -166,29 +168,29 @@ def predict(repeats: int) -> Iterator[str]:
         yield f"| {n} | " + " | ".join(f"{1e3 * value:.2f}" for value in seconds) + " |"
 
 
-def discrete_actions(repeats: int) -> Iterator[str]:
+def discrete_actions(repeats: int, device: str) -> Iterator[str]:
     """(d) number of discrete actions, CHDP's defaults"""
     yield "| K | gradient step, ms | ratio to K = 4 |\n|---|---|---|"
     sizes = (4, 64, 1024, 65_536)
-    models = [build(CHDP, lambda k=k: ManyActions(k)) for k in sizes]
+    models = [build(CHDP, lambda k=k: ManyActions(k), device=device) for k in sizes]
     seconds = medians([lambda m=m: m.train(2, 128) for m in models], repeats)
     for k, value in zip(sizes, seconds, strict=True):
         yield f"| {k:,} | {1e3 * value / 2:.1f} | {value / seconds[0]:.2f} |"
 
 
-def baselines(repeats: int) -> Iterator[str]:
+def baselines(repeats: int, device: str) -> Iterator[str]:
     """(g) gradient step of every algorithm; networks of 2 x 256, batch 128 (CHDP, PaperCHDP: their defaults)"""
     rows: list[tuple[str, Callable[[], object], int]] = []
-    settings = dict(policy_kwargs=dict(net_arch=[256, 256]))
+    settings = dict(policy_kwargs=dict(net_arch=[256, 256]), device=device)
     rows.append(("SB3's TD3", build(TD3, wrapper=FlattenHybridAction, **settings), 2))
     others = {name: algorithm for name, algorithm in off_policy().items() if not issubclass(algorithm, CHDP)}
     rows += [(name, build(algorithm, **settings), 2) for name, algorithm in others.items()]
     rows.append(("PDQN-TD3, multi_pass", build(PDQNTD3, multi_pass=True, **settings), 2))
-    rows += [("CHDP", build(CHDP), 2), ("PaperCHDP", build(PaperCHDP), 1)]
+    rows += [("CHDP", build(CHDP, device=device), 2), ("PaperCHDP", build(PaperCHDP, device=device), 1)]
     seconds = medians([lambda m=model, n=n: m.train(n, 128) for _, model, n in rows], repeats)  # type: ignore[attr-defined]
     per_step = [value / n for value, (_, _, n) in zip(seconds, rows, strict=True)]
     env = make_vec_env(ENV_ID, 8, seed=0)
-    hppo = HPPO("MlpPolicy", env, n_steps=128, n_epochs=1, seed=0, device="cpu", policy_kwargs=settings["policy_kwargs"])
+    hppo = HPPO("MlpPolicy", env, n_steps=128, n_epochs=1, seed=0, **settings)
     hppo.learn(1024)
     (rollout,) = medians([hppo.train], repeats // 3)  # 16 minibatches
     per_step.append(rollout / 16)
@@ -197,13 +199,13 @@ def baselines(repeats: int) -> Iterator[str]:
         yield f"| {name} | {1e3 * value:.2f} | {value / per_step[0]:.2f} |"
 
 
-def loop(repeats: int) -> Iterator[str]:
+def loop(repeats: int, device: str) -> Iterator[str]:
     """(f) the whole training loop of CHDP, one gradient step for two environment steps, and where its time goes"""
     yield "| environments | steps/s | gradient steps per step | acting | environment | buffer | update | rest |"
     yield "|---|---|---|---|---|---|---|---|"
     for n_envs in (1, 8):
         shares = dict.fromkeys(("acting", "environment", "buffer", "update"), 0.0)
-        model = build(CHDP, n_envs=n_envs, train_freq=max(2 // n_envs, 1))
+        model = build(CHDP, n_envs=n_envs, train_freq=max(2 // n_envs, 1), device=device)
         model.gradient_steps = max(n_envs // 2, 1)
 
         def timed(owner: Any, method: str, name: str, shares: dict[str, float] = shares) -> None:
@@ -249,28 +251,33 @@ TABLES = {
         guards, checkpoints,
     )
 }  # fmt: skip
+# What a GPU may change
+OF_NETWORKS = ["step", "predict", "discrete_actions", "loop", "baselines"]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tables", nargs="+", choices=list(TABLES), help="print only these")
     parser.add_argument("--repeats", type=int, default=30)
+    parser.add_argument("--device", default="cpu", help="another one than the CPU: the tables of networks, printed only")
     args = parser.parse_args()
+    names = args.tables or (list(TABLES) if args.device == "cpu" else OF_NETWORKS)
     th.set_num_threads(1)
     text = (
         f"sb3_chdp {sb3_chdp.__version__}, stable_baselines3 {sb3.__version__}, torch {th.__version__}, "
-        f"{machine(threads=1)}\n"
+        f"{machine(threads=1)}, device {args.device}\n"
     )
     print(text)
-    for name in args.tables or TABLES:
+    for name in names:
         title = f"\n### {(TABLES[name].__doc__ or '').strip()}\n"
         print(title)
         lines = []
-        for line in TABLES[name](args.repeats):
+        options = {"device": args.device} if name in OF_NETWORKS else {}
+        for line in TABLES[name](args.repeats, **options):
             print(line, flush=True)
             lines.append(line)
         text += "\n".join([title, *lines, ""])
-    if not args.tables:
+    if names == list(TABLES):
         replace_section(README, "speed", text.rstrip())
 
 

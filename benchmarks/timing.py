@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -22,6 +23,8 @@ def medians(
         for function, values in zip(functions, durations, strict=True):
             start = clock()
             function()
+            if th.cuda.is_initialized():
+                th.cuda.synchronize()
             values.append(clock() - start)
     return [statistics.median(values) for values in durations]
 
