@@ -92,6 +92,11 @@ def test_bad_arguments(kwargs, name):
         filled_buffer(**kwargs)
 
 
+def test_dict_observations_need_the_buffer_for_dicts():
+    with pytest.raises(ValueError, match="replay_buffer_class must be PrioritizedDictReplayBuffer for dict observations"):
+        PrioritizedReplayBuffer(20, spaces.Dict(a=BOX), spaces.Box(-1, 1, (1,)), "cpu")
+
+
 def test_observations_in_a_dict_are_normalised():
     env = VecNormalize(make_vec_env(lambda: HybridIdentityEnv(), 2), norm_reward=False)
     env.obs_rms.mean, env.obs_rms.var = np.full(4, 2.0), np.full(4, 4.0)

@@ -155,6 +155,17 @@ def test_logged_values():
     assert logged["train/n_updates"] == 2
 
 
+def test_usage_is_of_what_the_discrete_policy_draws():
+    model = filled_model(LayoutEnv(spaces.Tuple((spaces.Discrete(4), box(-1, 1, 1)))))
+    codewords, actor = model.actor.codebook.codewords, model.actor
+    actor.sample_latents = lambda features, *_, **__: (
+        codewords[:1].detach().expand(len(features), -1), th.zeros(len(features), dtype=th.long)
+    )  # fmt: skip
+    model.train(1, 32)
+    logged = model.logger.name_to_value
+    assert logged["train/codebook_usage"] == 0.25 and logged["train/codebook_perplexity"] == pytest.approx(1)
+
+
 def test_usage_of_every_leaf_is_logged():
     env = LayoutEnv(spaces.Dict(units=spaces.MultiBinary(6), mode=spaces.Discrete(32), set=box(-1, 1, 1)))
     model = filled_model(env)
@@ -186,7 +197,10 @@ def test_padding_reaches_nothing():
 
 def test_action_noise_spares_padding_and_is_clipped():
     noise = NormalActionNoise(np.zeros(2), 10 * np.ones(2))
-    model = fast_model(env=make_layout_env("nested"), action_noise=noise, learning_starts=0).learn(60)
+    model = fast_model(env=make_layout_env("nested"), action_noise=noise, learning_starts=0)
+    model._exploration_rate = lambda: 0.0  # exploratory actions have no noise
+    model.learn(60)
     data = sample(model, 64)
     mask = model.hybrid_space.spec.mask[data.discrete_actions].astype(bool)
     assert not data.parameters[~mask].any() and data.parameters.abs().max() <= 1
+    assert (data.parameters[mask].abs() == 1).float().mean() > 0.8

@@ -123,12 +123,20 @@ def test_it_explores_on_while_success_is_rare(n_envs, wrap):
 
 
 def test_a_loaded_model_goes_on(tmp_path):
-    model = fast_model(env=Rewarded(50), learning_starts=10**9).learn(203)
+    model = fast_model(env=Rewarded(3), learning_starts=10**9).learn(203)
     model.save(tmp_path / "model")
-    loaded = CHDP.load(tmp_path / "model", env=Rewarded(50))
-    assert loaded._exploration_rate() == model._exploration_rate() and loaded.returns_so_far == model.returns_so_far
+    loaded = CHDP.load(tmp_path / "model", env=Rewarded(3))
+    assert loaded._exploration_rate() == model._exploration_rate()
     loaded.learn(100, reset_num_timesteps=False)
     assert loaded.return_sums.n > model.return_sums.n and loaded.n_informative_steps > model.n_informative_steps
+
+
+def test_half_an_episode_has_no_return(tmp_path):
+    """Here all returns are equal; one of an episode and a half would be rarely bad, as if all of them told something."""
+    model = fast_model(env=Rewarded(10**6), learning_starts=10**9).learn(203).learn(204)
+    model.save(tmp_path / "model")
+    loaded = CHDP.load(tmp_path / "model", env=Rewarded(10**6)).learn(203, reset_num_timesteps=False)
+    assert loaded.return_sums.n > 2 * model.return_sums.n / 2 > 10 and loaded.return_sums.square == 0
 
 
 def test_nobody_needs_to_set_it():
@@ -197,6 +205,14 @@ def test_several_environments_explore(policy):
     observation_space = spaces.Dict({"vector": box(-1, 1, 2)}) if policy == "MultiInputPolicy" else None
     env = DummyVecEnv([lambda: make_layout_env(observation_space=observation_space)] * 3)
     model = CHDP(policy, env, n_diffusion_steps=2, learning_starts=10, seed=0)
-    before = snapshot(model)
+    before, choose, explored = snapshot(model), model._exploratory_rows, np.zeros(3, dtype=int)
+
+    def counted(rows, envs, *args):
+        chosen = choose(rows, envs, *args)
+        assert len(chosen) == len(envs)
+        explored[envs] += 1
+        return chosen
+
+    model._exploratory_rows = counted
     model.learn(60)
-    assert has_learnt(model, before)
+    assert has_learnt(model, before) and explored.min() > 5

@@ -124,8 +124,7 @@ def test_training(algorithm, masked, tmp_path):
 
 
 @pytest.mark.parametrize("algorithm", CLASSES)
-def test_two_choices_equal_their_joint_index_under_masks(algorithm):
-    """A mask that leaves one value per choice decides the action."""
+def test_a_mask_of_one_value_per_choice_decides(algorithm):
     model = make_model(
         algorithm, LayoutEnv(spaces.Tuple((spaces.MultiDiscrete([3, 4]), box(0, 1, 2)))), action_layout="factored"
     )

@@ -156,7 +156,7 @@ def test_masks_and_several_environments():
     assert ForesightSums(*model.foresight_sums).n > MIN_CLAIMS
 
 
-def test_the_paper_looks_ahead():
-    model = fast_model(PaperCHDP, learning_starts=10)
-    model.learn(40)
-    assert model.critic.foresight == 1 and model.foresight_sums == ForesightSums()
+def test_the_paper_looks_ahead(monkeypatch):
+    monkeypatch.setattr(exploring, "MIN_UPDATES", 0)
+    paper, model = (fast_model(algorithm, learning_starts=10).learn(40) for algorithm in (PaperCHDP, CHDP))
+    assert paper.critic.foresight == 1 and paper.foresight_sums == ForesightSums() != model.foresight_sums

@@ -17,7 +17,7 @@ from sb3_chdp.common.evaluation import evaluate_policy
 from sb3_chdp.common.masks import read_masks
 from sb3_chdp.common.utils import nearest_row
 from tests.algorithms import fast_model, has_learnt, make_model, snapshot
-from tests.hybrid_envs import FewValidEnv, MaskedEnv, box, layouts, make_layout_env
+from tests.hybrid_envs import FewValidEnv, LayoutEnv, MaskedEnv, box, layouts, make_layout_env
 
 CLASSES = [pytest.param(line.load_class(), id=name) for name, line in REGISTRY.items()]
 TD3_BASED = [PATD3, HHQNTD3, PDQNTD3, HyARTD3]
@@ -83,6 +83,34 @@ def test_an_environment_that_allows_nothing(algorithm):
     env.envs[1] = StuckEnv()
     with pytest.raises(ValueError, match=r"got none from environment\(s\) \[1\]"):
         make_model(algorithm, env).learn(60)
+
+
+@pytest.mark.parametrize("algorithm", CLASSES)
+def test_a_game_that_is_over_allows_nothing(algorithm):
+    class GameEnv(MaskedEnv):
+        def step(self, action):
+            obs, reward, *_, info = super().step(action)
+            over = self.t % 5 == 0
+            return obs, reward, over, False, {**info, "action_masks": self.masks & (not over)}
+
+    make_model(algorithm, make_vec_env(GameEnv, 2)).learn(60)
+
+
+def test_trained_with_masks_and_then_without(tmp_path):
+    make_model(PATD3, MaskedEnv(), n_steps=3).learn(40).save(tmp_path / "model")
+    env = LayoutEnv(layouts()["nested"], MaskedEnv().observation_space)
+    loaded = PATD3.load(tmp_path / "model", env=env, use_masking=False).learn(40)
+    assert type(loaded.replay_buffer) is NStepReplayBuffer
+
+
+def test_n_step_returns_of_dict_observations_are_refused():
+    class DictEnv(MaskedEnv):
+        def __init__(self):
+            super().__init__()
+            self.observation_space = spaces.Dict({"mask": self.observation_space})
+
+    with pytest.raises(AssertionError, match="N-step returns are not supported for Dict"):
+        make_model(PATD3, DictEnv(), "MultiInputPolicy", n_steps=3)
 
 
 @pytest.mark.parametrize("n_steps, explicit", [(1, False), (3, False), (3, True)])

@@ -98,6 +98,10 @@ def test_alternatives_differ_in_one_choice():
         # Every value of every choice, the present one among them
         assert changed.sum(dim=2).max() == 1 and (changed.sum(dim=1) == th.tensor(RADICES) - 1).all()
         assert all(len({tuple(row) for row in rows}) == 1 + sum(RADICES) - len(RADICES) for rows in others.tolist())
+    # Where there are many choices, a few alternatives change the last ones too
+    many = ProductCodebook((2,) * 40, 2)
+    changed = many.alternatives(th.zeros(1, 40, dtype=th.long), 64, True)[0].sum(dim=0)
+    assert changed[:4].any() and changed[-4:].any()
     some, again = (codebook.alternatives(k, 4, True) for _ in range(2))
     assert th.equal(some, again) and (codebook.alternatives(k, 4, False) != codebook.alternatives(k, 4, False)).any()
 

@@ -55,6 +55,12 @@ def test_over_observations(observations):
         assert max(abs(np.corrcoef(column[:-lag], column[lag:])[0, 1]) for column in noise.T) < limit
 
 
+def test_the_order_of_keys_makes_no_difference():
+    parts = OBSERVATIONS["dict"]
+    swapped = {key: parts[key] for key in reversed(parts)}
+    assert th.equal(repeatable_noise(parts, 5), repeatable_noise(swapped, 5))
+
+
 def test_within_an_observation(observations):
     """The chains of one observation are as unrelated as those of different ones."""
     noise = repeatable_noise(rows_of(observations, slice(0, 100)), 20, 2, 25).numpy()

@@ -274,13 +274,14 @@ class CHDP(ExploringAlgorithm):
         for name, values in logs.items():
             self.logger.record(f"train/{name}", th.stack(values).mean().item())
         if "continuous_loss" in logs:
-            self._log_usage(k)
+            # Without the uniformly random ones
+            self._log_usage(k[round(self.uniform_fraction * len(k)) :])
 
     def _log_usage(self, k: th.Tensor) -> None:
         """
         Log how many discrete actions are in use, of a factored space the mean over its choices and that of every leaf.
 
-        :param k: discrete actions of a batch
+        :param k: discrete actions that the policy draws for a batch
         """
         leaves = self.hybrid_space.spec.choices_of_leaves
         for name, values in zip(("usage", "perplexity"), self.actor.codebook.usage(k), strict=True):

@@ -63,10 +63,12 @@ class Codebook(nn.Module):
         :param k: (B,) discrete actions
         :param n: number of alternatives to each, at most K
         :param repeatable: whether to return the same ones always
-        :return: (B, n) successive discrete actions from a random one on, from 0 on if ``repeatable``
+        :return: (B, n) successive discrete actions from a random one on; if ``repeatable``, evenly spread ones
         """
-        first = 0 if repeatable else th.randint(self.n_discrete_actions, (len(k), 1), device=k.device)
-        return ((first + th.arange(n, device=k.device)) % self.n_discrete_actions).expand(k.shape[0], n)
+        places = th.arange(n, device=k.device)
+        if repeatable:
+            return (places * self.n_discrete_actions // n).expand(k.shape[0], n)
+        return (th.randint(self.n_discrete_actions, (len(k), 1), device=k.device) + places) % self.n_discrete_actions
 
     def allowed(self, k: th.Tensor, masks: th.Tensor) -> th.Tensor:
         """

@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
 
 from sb3_chdp.chdp.exploration import ReturnSums, exploration_rate, informative_steps
 from sb3_chdp.chdp.foresight import Claims, ForesightSums, explore
@@ -36,6 +38,19 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         self.foresight_sums = ForesightSums()
         # Those of the present step
         self._claims: Claims | None = None
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if reset_num_timesteps or self._last_obs is None:
+            # The environment is reset: no return is that of half an episode and of another one
+            self.returns_so_far = []
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _exploration_rate(self) -> float:
         n_values = sum(self.hybrid_space.spec.radices)

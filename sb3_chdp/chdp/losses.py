@@ -44,7 +44,8 @@ def next_values(policy: CHDPPolicy, observations: PyTorchObs, masks: th.Tensor |
 @th.no_grad()
 def target_values(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> th.Tensor:
     """
-    Eq. 11, y = r + gamma min_j Q'_j(s', e', a'), see :func:`next_values`, and r alone.
+    Eq. 11, y = r + gamma min_j Q'_j(s', e', a'), see :func:`next_values`, and r alone,
+    with n-step returns the n rewards.
 
     :param policy: the networks
     :param replay_data: a batch

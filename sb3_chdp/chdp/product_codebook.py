@@ -58,12 +58,15 @@ class ProductCodebook(ProductTable):
         :param k: (B, L) discrete actions
         :param n: number of alternatives to each, at most the sum of the radices
         :param repeatable: whether to give the same choices the same values always
-        :return: (B, n, L) the actions with one value changed: successive values of all choices from a random one on, from the
-            first on if ``repeatable``
+        :return: (B, n, L) the actions with one value changed: successive values of all choices from a random one on; if
+            ``repeatable``, evenly spread ones
         """
-        n_values = len(self.values)
-        first = 0 if repeatable else th.randint(n_values, (len(k), 1), device=k.device)
-        changes = self.values[(first + th.arange(n, device=k.device)) % n_values].expand(k.shape[0], n, 2)
+        n_values, places = len(self.values), th.arange(n, device=k.device)
+        if repeatable:
+            places = places * n_values // n
+        else:
+            places = (th.randint(n_values, (len(k), 1), device=k.device) + places) % n_values
+        changes = self.values[places].expand(k.shape[0], n, 2)
         return k[:, None].repeat(1, n, 1).scatter(2, changes[..., :1], changes[..., 1:])
 
     def allowed(self, k: th.Tensor, masks: th.Tensor) -> th.Tensor:

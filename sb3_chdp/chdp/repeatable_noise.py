@@ -56,7 +56,8 @@ def repeatable_uniform(observations: PyTorchObs, *shape: int, seed: int = 0) -> 
 
 def _fractions(observations: PyTorchObs, n_values: int, seed: int) -> th.Tensor:
     """:return: (B, n_values) float64 numbers in [0, 1)"""
-    parts = observations.values() if isinstance(observations, dict) else [observations]
+    # Sorted, as the order of the keys depends on where a dict comes from
+    parts = [observations[key] for key in sorted(observations)] if isinstance(observations, dict) else [observations]
     entries = th.cat([part.reshape(part.shape[0], -1).double() for part in parts], dim=1)
     scaled = entries.sign() * (1 + entries.abs() / SMALL_ENTRY).log()
     frequencies = th.as_tensor(_observation_frequencies(entries.shape[1]), device=entries.device)

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecNormalize
@@ -48,11 +49,24 @@ class PrioritizedReplayBuffer(ReplayBuffer):
     :param alpha: how much errors count, from 0 (uniform sampling) to 1
     :param beta: how much of the sampling's bias the weights take back, from 0 to 1 (all of it)
     :param kwargs: those of :class:`stable_baselines3.common.buffers.ReplayBuffer`
-    :raises ValueError: for ``optimize_memory_usage=True``, or an alpha or beta out of range
+    :raises ValueError: for ``optimize_memory_usage=True``, an alpha or beta out of range, or dict observations, which need
+        :class:`PrioritizedDictReplayBuffer`
     """
 
-    def __init__(self, *args: Any, alpha: float = 0.6, beta: float = 0.4, **kwargs: Any):
-        super().__init__(*args, **kwargs)
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space[Any],
+        *args: Any,
+        alpha: float = 0.6,
+        beta: float = 0.4,
+        **kwargs: Any,
+    ):
+        if isinstance(observation_space, spaces.Dict) and not isinstance(self, DictReplayBuffer):
+            raise ValueError(
+                "replay_buffer_class must be PrioritizedDictReplayBuffer for dict observations, got PrioritizedReplayBuffer"
+            )
+        super().__init__(buffer_size, observation_space, *args, **kwargs)
         if self.optimize_memory_usage:
             raise ValueError(f"{type(self).__name__} does not support optimize_memory_usage=True")
         check_fraction(alpha=alpha, beta=beta)

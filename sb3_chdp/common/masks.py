@@ -13,13 +13,14 @@ from sb3_chdp.common.spaces import HybridActionSpec
 INFO_KEY = "action_masks"
 
 
-def read_masks(spec: HybridActionSpec, masks: Any, n: int) -> np.ndarray:
+def read_masks(spec: HybridActionSpec, masks: Any, n: int, first: int = 0) -> np.ndarray:
     """
     :param spec: the action space
     :param masks: (n, M) or (M,) booleans, False for what may not be taken: M is the sum of the numbers of values of all
         discrete parts, whose masks follow each other as for sb3-contrib's ``MaskablePPO``, or the number K of discrete
         actions, if these form one index; where both are the same number, it is the first
     :param n: number of environments
+    :param first: index of the first of them, for messages
     :return: (n, sum of the radices) booleans for the choices of rows, (n, K) unless the space is factored
     :raises ValueError: for another shape, or if nothing is allowed in an environment; the message names it
     """
@@ -32,7 +33,7 @@ def read_masks(spec: HybridActionSpec, masks: Any, n: int) -> np.ndarray:
     if array.shape[1] == spec.n_mask_values:
         array = spec.join_masks(array)
     table, exists = value_table(spec.radices)
-    stuck = np.flatnonzero(~(array[:, table] & exists).any(axis=2).all(axis=1)).tolist()
+    stuck = (first + np.flatnonzero(~(array[:, table] & exists).any(axis=2).all(axis=1))).tolist()
     if stuck:
         raise ValueError(f"action_masks must allow at least one discrete action, got none from environment(s) {stuck}")
     return array

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -111,15 +112,20 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         self.use_masking = self._resolve_masking(use_masking)
 
     def _setup_model(self) -> None:
+        # With n-step returns SB3 refuses them
+        has_dicts = isinstance(self.observation_space, spaces.Dict)
         try:
             with warnings.catch_warnings():
-                if self.use_masking and self.n_steps > 1 and self.replay_buffer_class is None:
+                if self.use_masking and self.n_steps > 1 and self.replay_buffer_class is None and not has_dicts:
                     # In place of SB3's, which it would choose; its warning that n_steps does not count is wrong here
                     warnings.filterwarnings("ignore", message="`n_steps=")
                     self.replay_buffer_class = MaskedNStepReplayBuffer
                     self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": self.n_steps, "gamma": self.gamma}
                 elif self.use_masking and self.replay_buffer_class is NStepReplayBuffer:
                     self.replay_buffer_class = MaskedNStepReplayBuffer
+                elif not self.use_masking and self.replay_buffer_class is MaskedNStepReplayBuffer:
+                    # A model that was trained with masks
+                    self.replay_buffer_class = NStepReplayBuffer
                 super()._setup_model()
         except MemoryError as error:
             raise ValueError(
@@ -282,17 +288,18 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         """
         SB3's, with the masks of the next states.
 
-        That of the last state of an episode is lost when the environment is reset: it is ``info["action_masks"]`` if the
-        environment leaves it there, else that of the state before.
+        That of the last state of an episode is lost when the environment is reset. Where a time limit ended the episode it is
+        ``info["action_masks"]`` if the environment leaves it there, else that of the state before; of a terminal state none is
+        needed.
         """
         masks = self._action_masks()
         if masks is not None:
             columns = self.hybrid_space.columns
             next_masks = masks.copy()
             for i in np.flatnonzero(dones):
-                given = infos[i].get(INFO_KEY)
+                given = infos[i].get(INFO_KEY) if infos[i].get("TimeLimit.truncated", False) else None
                 before = columns.masks(buffer_action[i : i + 1])
-                next_masks[i] = (before if given is None else read_masks(self.hybrid_space.spec, given, 1))[0]
+                next_masks[i] = (before if given is None else read_masks(self.hybrid_space.spec, given, 1, first=i))[0]
             columns.view(buffer_action, "next_masks")[:] = pack_bits(next_masks)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 

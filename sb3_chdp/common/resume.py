@@ -8,14 +8,12 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 from weakref import WeakKeyDictionary
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chdp.common.checkpoint_store import CheckpointStore, GenerationWriter
 from sb3_chdp.common.checks import check_at_least
@@ -269,7 +267,9 @@ def resume(directory: str | Path, env: GymEnv, device: th.device | str = "auto",
     vec_env.reset()
     restore_env(vec_env, state["env"])
     if state["env"]["states"] is None or not has_state(vec_env):
-        _begin_episode(model)
+        warnings.warn("The environment has no get_state() and set_state(): a fresh episode begins", stacklevel=2)
+        # learn() will reset the environment
+        model._last_obs = None
     restore_generators(model, state["later"]["generators"])
     _RUNS[model] = _Run({Path(directory).resolve(): store}, state["later"])
     return model
@@ -284,13 +284,3 @@ def last_checkpoint(model: BaseAlgorithm) -> Path | None:
 
 def _replay_buffer(model: BaseAlgorithm) -> ReplayBuffer | None:
     return getattr(model, "replay_buffer", None)
-
-
-def _begin_episode(model: BaseAlgorithm) -> None:
-    warnings.warn("The environment has no get_state() and set_state(): a fresh episode begins", stacklevel=3)
-    assert model.env is not None
-    model._last_obs = model.env.reset()  # type: ignore[assignment]
-    model._last_episode_starts = np.ones(model.n_envs, dtype=bool)
-    normalize = model.get_vec_normalize_env()
-    if isinstance(normalize, VecNormalize):
-        model._last_original_obs = normalize.get_original_obs()
