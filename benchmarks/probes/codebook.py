@@ -4,8 +4,8 @@ The codebooks of Hard Move.
     python -m benchmarks.probes.codebook
 
 Draws figures/codebook.png: the 64 codewords of Hard Move 6 on their two main axes, coloured by the direction in which the
-action moves the agent. Prints for n = 4, 6, 8 and 10 how much of the variance of the pushes a linear function of the codewords
-explains (of random ones: latent_dim / K).
+action moves the agent. Prints for n = 4, 6, 8 and 10, as far as there are models, how much of the variance of the pushes a
+linear function of the codewords explains (of random ones: latent_dim / K).
 """
 
 import matplotlib
@@ -16,7 +16,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from benchmarks.probes.rollout import FIGURES, load_model, parser_of
+from benchmarks.probes.rollout import FIGURES, load_model, parser_of, published
 from sb3_chdp.envs.hard_move import motion_table
 
 
@@ -60,7 +60,7 @@ def plot(codewords: np.ndarray, motions: np.ndarray) -> None:
 def main() -> None:
     parser_of(__doc__).parse_args()
     print("| environment | variance of the pushes that codewords explain |\n|---|---|")
-    for n in (4, 6, 8, 10):
+    for n in [n for n in (4, 6, 8, 10) if published(f"HardMove{n}-v0").exists()]:
         codewords, motions = codewords_of(load_model(f"HardMove{n}-v0")), motion_table(n)
         print(f"| HardMove{n}-v0 | {100 * explained_share(codewords, motions):.0f} % |")
         if n == 6:

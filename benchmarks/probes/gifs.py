@@ -12,7 +12,7 @@ from typing import Any
 
 from PIL import Image
 
-from benchmarks.probes.rollout import BENCHMARKS, load_model, make_env, parser_of, play
+from benchmarks.probes.rollout import BENCHMARKS, load_model, make_env, parser_of, play, published
 from sb3_chdp.envs import ENV_IDS
 
 IMAGES = BENCHMARKS.parent / "docs" / "images"
@@ -62,9 +62,9 @@ def record(model: Any, env_id: str, path: Path, episodes: int = EPISODES) -> Non
 
 def main() -> None:
     parser = parser_of(__doc__)
-    parser.add_argument("--envs", nargs="+", default=ENV_IDS, choices=ENV_IDS, metavar="ENV", help=", ".join(ENV_IDS))
+    parser.add_argument("--envs", nargs="+", choices=ENV_IDS, metavar="ENV", help="those with a published model if not given")
     args = parser.parse_args()
-    for env_id in args.envs:
+    for env_id in args.envs or [env_id for env_id in ENV_IDS if published(env_id).exists()]:
         path = IMAGES / f"{env_id}.gif"
         record(load_model(env_id), env_id, path)
         print(f"{path.name}: {path.stat().st_size / 1e3:.0f} kB")

@@ -26,15 +26,23 @@ class Episode(NamedTuple):
     success: bool
 
 
+def published(env_id: str, algorithm: type[BaseAlgorithm] = CHDP) -> Path:
+    """:return: zip of the published model of an environment, which need not exist"""
+    folders = {"CHDP": "chdp", "HyARTD3": "hyar_td3"}
+    return BENCHMARKS / "models" / folders[algorithm.__name__] / f"{env_id}_1" / f"{env_id}.zip"
+
+
 def load_model(env_id: str, algorithm: type[BaseAlgorithm] = CHDP, path: str | None = None) -> BaseAlgorithm:
     """
     :param env_id: environment, without the namespace
     :param algorithm: class of the model
     :param path: zip of a model; the published one if None
     :return: the model, on the CPU
+    :raises SystemExit: if there is no published one
     """
-    folders = {"CHDP": "chdp", "HyARTD3": "hyar_td3"}
-    return algorithm.load(path or BENCHMARKS / "models" / folders[algorithm.__name__] / f"{env_id}_1" / env_id, device="cpu")
+    if path is None and not published(env_id, algorithm).exists():
+        raise SystemExit(f"There is no published model of {env_id}: train one, then see benchmarks/release.py")
+    return algorithm.load(path or published(env_id, algorithm), device="cpu")
 
 
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:
