@@ -22,7 +22,7 @@ train: $(STAMP)
 	$(BIN)/sb3-chdp enjoy --env Platform-v0 --folder logs --no-render --n-timesteps 1000 | grep --invert-match "^Episode "
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist loadfile -q --nbmake tests notebooks
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -q --nbmake notebooks tests
 
 format: $(STAMP)
 	$(BIN)/ruff check --select I --fix $(SOURCES)
