@@ -8,13 +8,14 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from gymnasium.utils.env_checker import data_equivalence
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chdp.common.checks import check_observation_space
-from sb3_chdp.common.masks import read_masks
+from sb3_chdp.common.masks import allowed_now
 from sb3_chdp.common.space_mismatch import mismatch
 from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.wrappers import FlattenHybridAction, with_scalars
@@ -55,8 +56,18 @@ def check_hybrid_env(env: gym.Env, action_layout: str = "auto", warn: bool = Tru
         for sentence in [_unusual_space(spec), *player.oddities(), player.seed_oddity()]:
             if sentence is not None:
                 warnings.warn(sentence, stacklevel=2)
-    flat = FlattenHybridAction(env, action_layout)
+    flat = _AllowedFlatActions(env, action_layout)
     _call("SB3's check_env", check_env, flat, warn=warn, skip_render_check=skip_render_check)
+
+
+class _AllowedFlatActions(FlattenHybridAction):
+    """For SB3's ``check_env``, which knows no masks: of the scores those of allowed actions decide."""
+
+    def action(self, action: np.ndarray) -> Any:
+        masks = allowed_now(self.env, self.score_space.spec)
+        if masks is not None:
+            action = self.score_space.mask_scores(th.as_tensor(action)[None], th.as_tensor(masks)).numpy()[0]
+        return super().action(action)
 
 
 def _check_is_env(env: Any) -> None:
@@ -98,7 +109,8 @@ class _Player:
 
     def __init__(self, env: gym.Env, spec: HybridActionSpec):
         self.env, self.spec = env, spec
-        self.n_steps = self.n_successes = 0
+        # Steps whose infos say whether they are a success, of all and of the last ones of episodes
+        self.n_steps = self.n_successes = self.n_ends = self.n_successes_at_ends = 0
         # Length of each random episode, and whether it ended by termination
         self.episodes: list[tuple[int, bool]] = []
         self.overwrites = False
@@ -148,9 +160,14 @@ class _Player:
         self._check_info(info, "step()")
         self.n_steps += 1
         self.n_successes += "is_success" in info
-        # Monitor and EvalCallback fail when only some steps report it
-        if self.n_successes not in (0, self.n_steps):
-            raise AssertionError("info['is_success'] must be there on every step or on none: set it in every step()")
+        if terminated or truncated:
+            self.n_ends += 1
+            self.n_successes_at_ends += "is_success" in info
+        # Monitor and EvalCallback, which read it at the end of episodes, fail when only some report it
+        if self.n_successes_at_ends not in (0, self.n_ends):
+            raise AssertionError(
+                "info['is_success'] must be there at the end of every episode or of none: set it in every step()"
+            )
         return obs, float(reward), terminated, truncated
 
     def _check_reward(self, reward: Any, action: Any) -> None:
@@ -206,10 +223,7 @@ class _Player:
                 obs, length = self.reset(), 0
 
     def _random_row(self, rng: np.random.Generator) -> np.ndarray:
-        masks = None
-        if self.env.has_wrapper_attr("action_masks"):
-            masks = read_masks(self.spec, self.env.get_wrapper_attr("action_masks")(), 1)
-        return self.spec.sample_rows(rng, 1, masks)[0]
+        return self.spec.sample_rows(rng, 1, allowed_now(self.env, self.spec))[0]
 
     def oddities(self) -> list[str]:
         """:return: what is legal but most likely not meant, in the episodes played"""
@@ -227,6 +241,10 @@ class _Player:
                     f"All random episodes terminated after {length} steps: if that is a time limit, return truncated=True "
                     "and terminated=False there, so that the future after it counts"
                 )
+        if self.n_successes not in (0, self.n_steps):
+            found.append(
+                "info['is_success'] is there on some steps only: the command line notes success if every step() sets it"
+            )
         if self.overwrites:
             found.append("step() overwrites the observation that it returned before: return a copy, obs.copy()")
         return found

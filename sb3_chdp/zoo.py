@@ -3,6 +3,7 @@
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import rl_zoo3.exp_manager
 import rl_zoo3.utils
 import yaml
@@ -16,6 +17,8 @@ from stable_baselines3.common.vec_env import VecEnv
 import sb3_chdp
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.evaluation import evaluate_policy
+from sb3_chdp.common.masks import allowed_now
+from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.registry import ALGORITHMS
 
 FLATTEN = "sb3_chdp.wrappers.FlattenHybridAction"
@@ -83,9 +86,17 @@ class HybridExperimentManager(ExperimentManager):
         """:return: action space of the environment, and info of a step"""
         env = gym.make(self.env_name.gym_id, **self.env_kwargs)
         env.reset(seed=0)
-        info = env.step(env.action_space.sample())[-1]
+        info = env.step(random_action(env))[-1]
         env.close()
         return env.action_space, info
+
+
+def random_action(env: gym.Env) -> Any:
+    """:return: an action that the masks of the environment, if it has any, allow"""
+    if not isinstance(env.action_space, HYBRID_SPACES):
+        return env.action_space.sample()
+    spec = HybridActionSpec(env.action_space)
+    return spec.to_native(spec.sample_rows(np.random.default_rng(0), 1, allowed_now(env, spec))[0])
 
 
 def _flatten(settings: dict[str, Any]) -> None:

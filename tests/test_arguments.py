@@ -167,6 +167,14 @@ def test_a_buffer_that_does_not_fit_into_the_memory(off_policy_algorithm):
         make_model(off_policy_algorithm, make_layout_env(), buffer_size=10**12)
 
 
+@pytest.mark.parametrize(
+    "algorithm, name, value", [(CHDP, "latent_dim", 33), (PDQNTD3, "multi_pass", True), (HyARTD3, "embedding_dim", 2)]
+)
+def test_arguments_of_the_algorithm_in_policy_kwargs(algorithm, name, value):
+    with pytest.raises(ValueError, match=f"policy_kwargs must not have '{name}': it is an argument of {algorithm.__name__}"):
+        make_model(algorithm, make_layout_env(), policy_kwargs={name: value})
+
+
 OTHERS = {
     "class": dict(replay_buffer_class=PrioritizedReplayBuffer),
     "observation_space": dict(env=make_layout_env(observation_space=box(-2, 2, 2))),

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chdp import CHDP, ScalarBoxes, check_hybrid_env
-from tests.hybrid_envs import LayoutEnv, box, layouts
+from tests.hybrid_envs import LayoutEnv, MaskedEnv, box, layouts
 
 ACTIONS = layouts()["shared"]
 PLANE = box(-1, 1, 2)
@@ -147,9 +147,9 @@ ERRORS = {
     "terminated": (lambda: walk(terminated=np.bool_(False)), "terminated must be a bool, got np.False_: return bool("),
     "truncated": (lambda: walk(truncated=0), "truncated must be a bool, got 0: return bool(truncated)"),
     "info": (lambda: walk(info=None), "The info of step() must be a dict, got None: return {} if there is nothing to say"),
-    "success_at_the_end_only": (
-        lambda: walk(terminated=False, info=lambda self: {"is_success": True} if self.t == 20 else {}),
-        "info['is_success'] must be there on every step or on none: set it in every step()",
+    "success_of_some_episodes": (
+        lambda: walk(info=lambda self: {"is_success": True} if self.t % 2 == 0 else {}),
+        "info['is_success'] must be there at the end of every episode or of none: set it in every step()",
     ),
     "wrong_key": (lambda: walk(reward=lambda self, action: action["x"]), "failed with TypeError: tuple indices must be"),
     "wants_scalars": (
@@ -187,6 +187,10 @@ WARNINGS = {
         lambda: walk(observation=lambda self: np.random.uniform(-1, 1, 2).astype(np.float32)),
         "Two runs with reset(seed=1) and the same actions differ",
     ),
+    "success_at_the_end_only": (
+        lambda: walk(terminated=False, info=lambda self: {"is_success": True} if self.t == 20 else {}),
+        "info['is_success'] is there on some steps only: the command line notes success if every step() sets it",
+    ),
     "overwritten": (lambda: walk(observation=one_array), "overwrites the observation that it returned before: return a copy"),
 }
 
@@ -195,6 +199,12 @@ def test_a_sound_environment_is_passed_in_silence():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_hybrid_env(Walk())
+
+
+def test_actions_that_masks_forbid_are_not_taken():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_hybrid_env(MaskedEnv())
 
 
 @pytest.mark.parametrize("mistake", ERRORS)

@@ -109,8 +109,13 @@ def test_rendering(env_id, monkeypatch):
     env.set_state({x: 1e6})
     env.render()
     env.close()
-    window = gym.make(env_id, render_mode="human")
+    assert copy.deepcopy(env).unwrapped.get_state() == env.unwrapped.get_state(), "pictures do not keep it from being copied"
+    # pygame has one window for all
+    window, other = (gym.make(env_id, render_mode="human") for _ in range(2))
     window.reset(seed=0)
+    other.reset(seed=0)
+    other.close()
+    window.render()
     window.close()
 
 

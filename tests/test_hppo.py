@@ -8,6 +8,7 @@ import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from torch.distributions import Categorical, Normal
 
 from sb3_chdp import HPPO
@@ -98,22 +99,25 @@ class QuietCallback(BaseCallback):
         return True
 
 
-def test_time_limits_bootstrap():
-    """Episodes end by truncation only: with reward 0 all returns come from the value function."""
+class NoReward(LayoutEnv):
+    def step(self, action):
+        obs, _, *rest = super().step(action)
+        return (obs, 0, *rest)
 
-    class NoReward(LayoutEnv):
-        def step(self, action):
-            obs, _, *rest = super().step(action)
-            return (obs, 0.0, *rest)
 
+@pytest.mark.parametrize("vec_env_cls", [DummyVecEnv, SubprocVecEnv])
+def test_time_limits_bootstrap(vec_env_cls):
+    """Episodes end by truncation only: with reward 0, a whole number, all returns come from the value function."""
+    env = make_vec_env(lambda: NoReward(layouts()["nested"]), vec_env_cls=vec_env_cls)
     # At this rate the value function stays what it is
-    model = make_model(HPPO, NoReward(layouts()["nested"]), gae_lambda=1.0, gamma=1.0, learning_rate=0.0)
+    model = make_model(HPPO, env, gae_lambda=1.0, gamma=1.0, learning_rate=0.0)
     with th.no_grad():
         for parameter in model.policy.value_net.parameters():
             parameter.fill_(0.0)
-        model.policy.value_net.bias.fill_(5.0)
+        model.policy.value_net.bias.fill_(5.5)
     model.learn(10)
-    np.testing.assert_allclose(model.rollout_buffer.returns, 5.0, atol=1e-5)
+    env.close()
+    np.testing.assert_allclose(model.rollout_buffer.returns, 5.5, atol=1e-5)
 
 
 def test_batch_size_of_one():

@@ -100,7 +100,7 @@ def test_trained_with_masks_and_then_without(tmp_path):
     make_model(PATD3, MaskedEnv(), n_steps=3).learn(40).save(tmp_path / "model")
     env = LayoutEnv(layouts()["nested"], MaskedEnv().observation_space)
     loaded = PATD3.load(tmp_path / "model", env=env, use_masking=False).learn(40)
-    assert type(loaded.replay_buffer) is NStepReplayBuffer
+    assert type(loaded.replay_buffer) is NStepReplayBuffer and loaded.replay_buffer.n_steps == 3
 
 
 def test_n_step_returns_of_dict_observations_are_refused():
@@ -210,6 +210,14 @@ def test_chdp_learns_faster_from_masks_than_from_a_penalty(seed):
     # Chance among the four that are allowed: 0.25
     assert returns[True] > 0.9
     assert returns[False] < returns[True] - 0.5
+
+
+def test_rl_zoo3_looks_at_an_allowed_action():
+    zoo = pytest.importorskip("sb3_chdp.zoo", exc_type=ImportError)
+    for seed in range(20):
+        env = MaskedEnv()
+        env.reset(seed=seed)
+        env.step(zoo.random_action(env))
 
 
 def test_rl_zoo3_evaluates_with_masks(monkeypatch):

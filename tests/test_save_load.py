@@ -1,12 +1,14 @@
 """Zips, replay buffers, resuming."""
 
 import io
+import warnings
 import zipfile
 
 import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import TD3
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -108,6 +110,17 @@ def test_zip_of_another_algorithm(algorithm, tmp_path):
     other.save(tmp_path / "td3")
     with pytest.raises(ValueError, match=f"td3 is not a {algorithm.__name__} model: its policy is of stable_baselines3.td3"):
         algorithm.load(tmp_path / "td3")
+
+
+def test_n_step_returns_follow_the_arguments_of_load(off_policy_algorithm, tmp_path):
+    make_model(off_policy_algorithm, make_layout_env(), n_steps=3).save(tmp_path / "model")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        same, other = (off_policy_algorithm.load(tmp_path / "model", **kwargs) for kwargs in ({}, dict(n_steps=5, gamma=0.5)))
+        one = off_policy_algorithm.load(tmp_path / "model", n_steps=1)
+    assert (same.replay_buffer.n_steps, same.replay_buffer.gamma) == (3, same.gamma)
+    assert (other.replay_buffer.n_steps, other.replay_buffer.gamma) == (5, 0.5)
+    assert type(one.replay_buffer) is ReplayBuffer
 
 
 def test_wrong_policy_kwargs_at_load(algorithm, tmp_path):

@@ -1,3 +1,4 @@
+import copy
 import pickle
 
 import numpy as np
@@ -158,6 +159,7 @@ def test_ambiguous_space_and_override():
     [
         (spaces.Tuple((spaces.Discrete(2), box(-np.inf, np.inf, 1))), r"action_space\[1\] is unbounded"),
         (spaces.Dict({"k": spaces.Discrete(2), "v": box(0, np.inf, 1)}), r"action_space\['v'\] is unbounded"),
+        (spaces.Tuple((spaces.Discrete(2), spaces.Box(0, np.inf, (1,), np.int32))), r"action_space\[1\] is unbounded"),
         (spaces.OneOf((box(0, 1, 1), box(0, np.inf, 1))), r"action_space.spaces\[1\] is unbounded"),
         (spaces.Tuple((box(0, 1, 1), box(0, 1, 1))), "no discrete part"),
         (spaces.Tuple((spaces.Discrete(2), spaces.Discrete(3))), "no continuous part"),
@@ -266,3 +268,11 @@ def test_hybrid_box_pickles_and_compares():
     assert pickle.loads(pickle.dumps(first)) == first
     assert first != HybridBox(layouts()["nested"], latent_dim=5) and first != HybridBox(layouts()["flat"], latent_dim=4)
     assert first != spaces.Box(first.low, first.high)
+
+
+@pytest.mark.parametrize("kind", [HybridBox, ConcatenatedBox, ScoreBox])
+def test_copies_of_rows_have_the_same_generator(kind):
+    space = kind(layouts()["nested"])
+    space.seed(0)
+    for twin in (copy.deepcopy(space), pickle.loads(pickle.dumps(space))):
+        np.testing.assert_array_equal(twin.sample(), copy.deepcopy(space).sample())

@@ -154,12 +154,15 @@ class HybridAlgorithm(BaseAlgorithm):
 
     def _setup_model(self) -> None:
         check_arguments(self)
+        of_algorithm = self._network_kwargs()
+        for name in self.policy_kwargs.keys() & of_algorithm.keys():
+            raise ValueError(f"policy_kwargs must not have {name!r}: it is an argument of {type(self).__name__} itself")
         check_policy_kwargs(self.policy_class, self.policy_kwargs)
         native_space, policy_kwargs = self.action_space, self.policy_kwargs
         self.hybrid_space = self._make_rows()
         # Buffer and policy are built for the rows; the model keeps the user's space
         self.action_space = self.hybrid_space
-        self.policy_kwargs = {**policy_kwargs, **self._network_kwargs()}
+        self.policy_kwargs = {**policy_kwargs, **of_algorithm}
         try:
             super()._setup_model()  # type: ignore[safe-super]  # of the SB3 algorithm that follows in the MRO
         finally:

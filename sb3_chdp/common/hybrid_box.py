@@ -87,11 +87,12 @@ class HybridBox(spaces.Box):
         return f"{type(self).__name__} of {self.native}"
 
     def __eq__(self, other: Any) -> bool:
-        return type(self) is type(other) and self.__reduce__() == other.__reduce__()
+        return type(self) is type(other) and self.__reduce__()[:2] == other.__reduce__()[:2]
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The tables of the spec follow from the native space
-        return type(self), (self.native, self.spec.layout, self.latent_dim, self.mask_parts)
+        arguments = (self.native, self.spec.layout, self.latent_dim, self.mask_parts)
+        return type(self), arguments, {"_np_random": self._np_random}
 
 
 class ConcatenatedBox(HybridBox):
@@ -121,7 +122,7 @@ class ConcatenatedBox(HybridBox):
         return self.columns.pack(discrete_actions=choices, parameters=parameters).astype(np.float32)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.native, self.spec.layout, self.mask_parts)
+        return type(self), (self.native, self.spec.layout, self.mask_parts), {"_np_random": self._np_random}
 
 
 class ScoreBox(ConcatenatedBox):

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from sb3_contrib.common.maskable.utils import get_action_masks
 from stable_baselines3.common.vec_env import VecEnv
@@ -37,6 +38,18 @@ def read_masks(spec: HybridActionSpec, masks: Any, n: int, first: int = 0) -> np
     if stuck:
         raise ValueError(f"action_masks must allow at least one discrete action, got none from environment(s) {stuck}")
     return array
+
+
+def allowed_now(env: gym.Env, spec: HybridActionSpec) -> np.ndarray | None:
+    """
+    :param env: a single environment
+    :param spec: its action space
+    :return: (1, K) booleans, which discrete actions are allowed now; None if it has no ``action_masks()``
+    :raises ValueError: see :func:`read_masks`
+    """
+    if not env.has_wrapper_attr("action_masks"):
+        return None
+    return read_masks(spec, env.get_wrapper_attr("action_masks")(), 1)
 
 
 def env_masks(spec: HybridActionSpec, env: VecEnv) -> np.ndarray:

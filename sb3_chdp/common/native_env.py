@@ -65,7 +65,8 @@ class NativeActionVecEnv(VecEnvWrapper):
                 check_numbers("The reward before normalization", self._normalize.old_reward)
             for i in np.flatnonzero(dones).tolist():
                 self._check_terminal(i, infos[i].get("terminal_observation"))
-        return obs, rewards, dones, infos
+        # SubprocVecEnv hands on whole numbers as such, to which no value can be added
+        return obs, np.asarray(rewards, dtype=np.float32), dones, infos
 
     def check_observations(self, obs: VecEnvObs) -> None:
         """

@@ -114,8 +114,10 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
     def _setup_model(self) -> None:
         # With n-step returns SB3 refuses them
         has_dicts = isinstance(self.observation_space, spaces.Dict)
+        given = self.replay_buffer_class, self.replay_buffer_kwargs
         try:
             with warnings.catch_warnings():
+                self.replay_buffer_kwargs = dict(self.replay_buffer_kwargs)
                 if self.use_masking and self.n_steps > 1 and self.replay_buffer_class is None and not has_dicts:
                     # In place of SB3's, which it would choose; its warning that n_steps does not count is wrong here
                     warnings.filterwarnings("ignore", message="`n_steps=")
@@ -123,15 +125,15 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
                     self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": self.n_steps, "gamma": self.gamma}
                 elif self.use_masking and self.replay_buffer_class is NStepReplayBuffer:
                     self.replay_buffer_class = MaskedNStepReplayBuffer
-                elif not self.use_masking and self.replay_buffer_class is MaskedNStepReplayBuffer:
-                    # A model that was trained with masks
-                    self.replay_buffer_class = NStepReplayBuffer
                 super()._setup_model()
         except MemoryError as error:
             raise ValueError(
                 f"buffer_size must be such that the replay buffer fits into the memory, got {self.buffer_size}: {error}. "
                 "optimize_memory_usage=True halves what observations need"
             ) from error
+        finally:
+            # What follows from other arguments is chosen anew when the model is loaded with other ones
+            self.replay_buffer_class, self.replay_buffer_kwargs = given
         self._warn_of_memory()
 
     def _warn_of_memory(self) -> None:
@@ -296,7 +298,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         if masks is not None:
             columns = self.hybrid_space.columns
             next_masks = masks.copy()
-            for i in np.flatnonzero(dones):
+            for i in np.flatnonzero(dones).tolist():
                 given = infos[i].get(INFO_KEY) if infos[i].get("TimeLimit.truncated", False) else None
                 before = columns.masks(buffer_action[i : i + 1])
                 next_masks[i] = (before if given is None else read_masks(self.hybrid_space.spec, given, 1, first=i))[0]

@@ -123,10 +123,13 @@ class HybridPolicy(BasePolicy):
         :return: the policy
         :raises ValueError: if the file is of another class or version, or if it is pickled and not trusted
         """
+        start = path.tell() if isinstance(path, io.IOBase) else 0
         policy = load_policy(cls, path, device)
         if policy is None:
             if not trusted:
                 raise refuse(path, "holds a policy in pickled form")
+            if isinstance(path, io.IOBase):
+                path.seek(start)
             policy = super().load(path, device)  # type: ignore[arg-type]
         return policy
 

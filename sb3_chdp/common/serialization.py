@@ -162,7 +162,7 @@ def encode(value: Any, arrays: list[np.ndarray] | None = None) -> Any:
         entry = {TAG: kind.__name__, "arguments": encode(ARGUMENTS[kind](value), arrays)}
         return {**entry, "state": encode(getattr(value, STATE[kind]), arrays)} if kind in STATE else entry
     if isinstance(value, HybridBox):
-        constructor, arguments = value.__reduce__()
+        constructor, arguments, _ = value.__reduce__()
         return {TAG: "hybrid_space", "class": encode(constructor), "arguments": encode(list(arguments), arrays)}
     if kind in ENUMS.values():
         return {TAG: "enum", "class": kind.__name__, "name": value.name}

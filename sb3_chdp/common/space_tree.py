@@ -141,7 +141,8 @@ def collect_boxes(space: spaces.Space[Any], prefix: Path, name: str | None = Non
             continue
         if leaf.dtype.kind not in "fiu":
             raise ValueError(f"{leaf_name} has dtype {leaf.dtype}; use a floating or integer Box")
-        if not (np.isfinite(leaf.low).all() and np.isfinite(leaf.high).all()):
+        # is_bounded() knows integers, whose bounds are numbers even if none were given
+        if not (leaf.is_bounded() and np.isfinite(leaf.low).all() and np.isfinite(leaf.high).all()):
             raise ValueError(
                 f"{leaf_name} is unbounded or has NaN bounds ({leaf}); give it finite bounds, in the environment or with "
                 "gymnasium.wrappers.TransformAction(env, lambda action: action, space), where space is the action space with "

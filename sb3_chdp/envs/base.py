@@ -157,6 +157,10 @@ class HybridEnv(gym.Env[np.ndarray, Any]):
         self._action, self._outcome = None, ""
         return self._observation()
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Surfaces of pygame cannot be copied
+        return {**self.__dict__, "_canvas": None}
+
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """:return: (height, width, 3) uint8 picture of the present frame; None if it went to a window"""
         if self.render_mode is None:

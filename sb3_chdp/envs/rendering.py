@@ -29,11 +29,14 @@ class Canvas:
         self.window: pygame.Surface | None = None
         pygame.font.init()
         if render_mode == "human":
-            pygame.display.init()
-            self.window = pygame.display.set_mode(size)
+            self._open()
             self.clock = pygame.time.Clock()
         self.surface = pygame.Surface((OVERSAMPLING * size[0], OVERSAMPLING * size[1]))
         self.fonts: dict[int, pygame.font.Font] = {}
+
+    def _open(self) -> None:
+        pygame.display.init()
+        self.window = pygame.display.set_mode(self.size)
 
     def _pixel(self, position: Position) -> tuple[int, int]:
         # Far outside the picture pygame's integers would overflow
@@ -94,6 +97,9 @@ class Canvas:
         picture = pygame.transform.smoothscale(self.surface, self.size)
         if self.window is None:
             return np.transpose(pygame.surfarray.array3d(picture), (1, 0, 2))
+        if pygame.display.get_surface() is not self.window:
+            # pygame has one window, which another environment has closed or taken
+            self._open()
         self.window.blit(picture, (0, 0))
         for _ in range(1 + self.fps // 2 * hold):
             pygame.event.pump()
