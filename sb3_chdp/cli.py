@@ -10,7 +10,7 @@ The command ``sb3-chdp``: rl_zoo3's scripts with the algorithms and environments
     sb3-chdp enjoy --env Platform-v0 -f benchmarks/models    watch a published one
     sb3-chdp record                              record a video of the last one
     sb3-chdp plot -y success -o curve.png        learning curves; without -o in a window
-    sb3-chdp all_plots | plot_from_file | record_training   the other scripts of rl_zoo3
+    sb3-chdp all_plots | plot_from_file          the other scripts of rl_zoo3
     sb3-chdp push_to_hub -orga me                publish the last one on the Hugging Face Hub
     sb3-chdp load_from_hub -orga me --env Platform-v0    download it
     sb3-chdp benchmark --envs MyEnv-v0 --gym-packages my_module --algos chdp hppo sb3:sac    compare algorithms
@@ -38,6 +38,7 @@ from sb3_chdp.zoo_arguments import (
     option,
     split_option,
     unknown,
+    with_folder_names,
 )
 
 # Module, and function in it; without one the module is run as a script
@@ -46,7 +47,6 @@ SCRIPTS = {
     "optimize": ("rl_zoo3.train", "train"),
     "enjoy": ("rl_zoo3.enjoy", "enjoy"),
     "record": ("rl_zoo3.record_video", None),
-    "record_training": ("rl_zoo3.record_training", None),
     "plot": ("rl_zoo3.plots.plot_train", "plot_train"),
     "all_plots": ("rl_zoo3.plots.all_plots", "all_plots"),
     "plot_from_file": ("rl_zoo3.plots.plot_from_file", "plot_from_file"),
@@ -77,7 +77,7 @@ def prepare_arguments(command: str, arguments: list[str]) -> list[str]:
     arguments = [argument.removeprefix(STOCK).replace(f"={STOCK}", "=", 1) for argument in arguments]
     if command in ("plot", "all_plots"):
         # The scripts that read folders do not know how rl_zoo3 names that of an id with a slash
-        arguments = [argument.replace("sb3_chdp/", "sb3_chdp-") for argument in arguments]
+        arguments = with_folder_names(arguments)
     algo_names = READERS[command].algo if command in READERS else ("--algo",)
     if command != "plot_from_file" and option(arguments, *algo_names) is None:
         arguments = [algo_names[0], next(iter(ALGORITHMS)), *arguments]

@@ -1,5 +1,6 @@
 """Registration with rl_zoo3. Importing this module imports rl_zoo3, which patches Gymnasium."""
 
+from functools import cached_property
 from typing import Any
 
 import gymnasium as gym
@@ -21,6 +22,8 @@ from sb3_chdp.common.masks import allowed_now
 from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.registry import ALGORITHMS
 
+# Of a random episode, at whose end some environments say whether it was a success
+EXAMPLE_STEPS = 1000
 FLATTEN = "sb3_chdp.wrappers.FlattenHybridAction"
 
 
@@ -71,32 +74,43 @@ class HybridExperimentManager(ExperimentManager):
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         hyperparams, saved = super().read_hyperparameters()
-        if self.algo not in ALGORITHMS and isinstance(self._example()[0], HYBRID_SPACES):
+        if hyperparams.get("env_kwargs") and not self.env_kwargs:
+            # Those of the YAML file are for evaluation too
+            self.env_kwargs = hyperparams["env_kwargs"]
+            self.eval_env_kwargs = self._eval_env_kwargs_args or self.env_kwargs
+        if self.algo not in ALGORITHMS and isinstance(self._example[0], HYBRID_SPACES):
             for settings in (hyperparams, saved):
                 _flatten(settings)
         return hyperparams, saved
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         wanted = dict.fromkeys([*self.monitor_kwargs.get("info_keywords", ()), "is_success"])
-        present = self._example()[1]
+        present = self._example[1]
         self.monitor_kwargs = {**self.monitor_kwargs, "info_keywords": tuple(key for key in wanted if key in present)}
         return super().create_envs(n_envs, eval_env, no_log)
 
+    @cached_property
     def _example(self) -> tuple[gym.Space[Any], dict[str, Any]]:
-        """:return: action space of the environment, and info of a step"""
+        """:return: action space of the environment, and what the infos of an episode hold"""
         env = gym.make(self.env_name.gym_id, **self.env_kwargs)
         env.reset(seed=0)
-        info = env.step(random_action(env))[-1]
+        infos: dict[str, Any] = {}
+        rng = np.random.default_rng(0)
+        for _ in range(EXAMPLE_STEPS):
+            *_, terminated, truncated, info = env.step(random_action(env, rng))
+            infos |= info
+            if terminated or truncated:
+                break
         env.close()
-        return env.action_space, info
+        return env.action_space, infos
 
 
-def random_action(env: gym.Env) -> Any:
+def random_action(env: gym.Env, rng: np.random.Generator) -> Any:
     """:return: an action that the masks of the environment, if it has any, allow"""
     if not isinstance(env.action_space, HYBRID_SPACES):
         return env.action_space.sample()
     spec = HybridActionSpec(env.action_space)
-    return spec.to_native(spec.sample_rows(np.random.default_rng(0), 1, allowed_now(env, spec))[0])
+    return spec.to_native(spec.sample_rows(rng, 1, allowed_now(env, spec))[0])
 
 
 def _flatten(settings: dict[str, Any]) -> None:

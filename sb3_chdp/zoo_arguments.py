@@ -28,7 +28,6 @@ _MODEL = Names(("-f", "--folder"), ("--algo",), ("--env",), ("--exp-id",))
 READERS = {
     "enjoy": _MODEL,
     "record": _MODEL,
-    "record_training": _MODEL,
     "push_to_hub": _MODEL,
     "plot": Names(("-f", "--exp-folder"), ("-a", "--algo"), ("-e", "--env")),
     "all_plots": Names(("-f", "--exp-folders"), ("-a", "--algos"), ("-e", "--env")),
@@ -146,6 +145,15 @@ def complete(command: str, arguments: list[str]) -> list[str]:
     if names.exp_id and option(arguments, *names.exp_id) is None:
         added += [names.exp_id[0], number]
     return [*added, *arguments]
+
+
+def with_folder_names(arguments: list[str]) -> list[str]:
+    """:return: the arguments of a script that looks for folders, with environments named as their folders are"""
+    named, inside = [], False
+    for argument in arguments:
+        inside = argument.partition("=")[0] in ("-e", "--env") or (inside and not argument.startswith("-"))
+        named.append(folder_name(argument) if inside else argument)
+    return named
 
 
 def folder_name(env_id: str) -> str:

@@ -1,6 +1,7 @@
 """``sb3-chdp train``: checkpoints from which a killed training goes on. Importing this module imports rl_zoo3."""
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -72,7 +73,8 @@ class ResumableExperimentManager(HybridExperimentManager):
             if self.show_progress:
                 self.callbacks[0].on_training_end()
             assert model.env is not None
-            model.env.close()
+            with suppress(EOFError, OSError):  # its processes may have been interrupted as well
+                model.env.close()
 
 
 def prepare_training(arguments: list[str]) -> list[str]:

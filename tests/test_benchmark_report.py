@@ -97,6 +97,12 @@ def test_a_grid_with_gaps_and_one_seed(tmp_path):
     figures.plot_scores(scores, ["a", "b"], ["E", "F"], tmp_path / "scores.png")
 
 
+def test_one_seed_has_no_interval():
+    results = make_results({("a", "E"): 10.0, ("a", "F"): 20.0})
+    scores = scores_of(results[results["seed"] == 0])
+    assert matrix_of(scores_of(results), "a") is not None and matrix_of(scores, "a") is None
+
+
 def test_curves_end_where_the_shortest_seed_does():
     results = make_results({("a", "E"): 10.0})
     shorter = results[(results["seed"] < 2) | (results["timesteps"] < 50)]

@@ -256,6 +256,8 @@ def test_workers_end_with_their_parent(tmp_path):
         (["--algos", "sb3:sax"], "did you mean sb3:sac?"),
         (["--algos", "chdp", "--envs", "Nowhere-v0"], "unknown environment 'Nowhere-v0'.*--gym-packages"),
         (["--algos", "chdp", "--slurm-partition", "main"], "needs --cluster slurm"),
+        (["--algos", "chdp", "--jobs", "-1"], "must be at least 1"),
+        (["--algos", "chdp", "--conf-folder", "nowhere"], "there is no YAML file in nowhere"),
         ([], "--envs and --algos"),
     ],
     ids=str,

@@ -15,11 +15,11 @@ from tests.algorithms import fast_model, filled_model, sample
 from tests.hybrid_envs import MaskedEnv, box, make_layout_env
 
 
-def weight(slope, noise, n=2000):
-    """What is claimed of rewards comes true, of what follows a share."""
+def weight(slope, noise, n=2000, of_rewards=1.0):
+    """What is claimed of rewards comes true, or a share of it, of what follows a share."""
     rng, sums = np.random.default_rng(0), ForesightSums()
     for reward, follows in rng.normal(size=(n, 2)):
-        sums = sums.add(reward, follows, reward + slope * follows + noise * rng.normal())
+        sums = sums.add(reward, follows, of_rewards * reward + slope * follows + noise * rng.normal())
     return sums.weight()
 
 
@@ -28,6 +28,11 @@ def test_the_weight_is_what_comes_true_of_claims():
     assert weight(slope=0.25, noise=0.01) == pytest.approx(0.5, abs=0.01)
     assert weight(slope=0.0, noise=1.0) < 0.3
     assert weight(slope=-0.5, noise=1.0) == 0
+
+
+def test_critics_that_are_wrong_about_rewards_are_no_evidence():
+    assert weight(slope=0.0, noise=0.01, of_rewards=0.25) == pytest.approx(0.5, abs=0.01)
+    assert weight(slope=-1.0, noise=1.0, of_rewards=-1.0) == 1
 
 
 def test_errors_that_make_up_for_each_other_are_none():

@@ -20,6 +20,7 @@ import gymnasium as gym
 import yaml
 from rich.console import Console
 from rich.live import Live
+from rich.markup import escape
 
 from sb3_chdp.benchmark import figures, jobs, paper, tables
 from sb3_chdp.benchmark.overview import Overview
@@ -79,6 +80,10 @@ def parse(arguments: list[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
         parser.error(f"{SLURM}... needs --cluster slurm")
     if args.what == "run" and not (args.envs and args.algos):
         parser.error("--envs and --algos say what to compare")
+    if (args.jobs or 1) < 1 or args.eval_episodes < 1:
+        parser.error("--jobs and --eval-episodes must be at least 1")
+    if args.conf_folder is not None and not list(Path(args.conf_folder).glob("*.yml")):
+        parser.error(f"--conf-folder: there is no YAML file in {args.conf_folder}")
     args.out = args.out or Path("logs") / ("paper" if args.what == "paper" else "benchmark")
     check_names(parser, args)
     return args, options
@@ -160,7 +165,8 @@ def train_all(runs: list[Run], args: argparse.Namespace, options: dict[str, Any]
                 queue.submit()
                 time.sleep(1)
                 for run, line, failed in queue.collect():
-                    live.console.print(f"[red]failed: {line}" if failed else line, highlight=False)
+                    # Messages have brackets that are no markup
+                    live.console.print(f"[red]failed: {escape(line)}" if failed else escape(line), highlight=False)
                     if failed:
                         failures.append(line)
                         overview.failed.add(str(run.folder))

@@ -79,14 +79,14 @@ def cell_of(scores: pd.DataFrame, row: str, env: str) -> pd.DataFrame:
 
 
 def matrix_of(scores: pd.DataFrame, row: str) -> np.ndarray | None:
-    """:return: (seeds, environments) success rates of an algorithm, None unless every environment has as many seeds"""
+    """:return: (seeds, environments) success rates of an algorithm, None unless all environments have the same two or more"""
     envs = list(dict.fromkeys(scores["env"]))
     columns = [cell_of(scores, row, env)["score"].to_numpy() for env in envs]
     if (
         len(envs) < 2
         or "return" in set(scores["metric"])
         or len({len(column) for column in columns}) > 1
-        or not len(columns[0])
+        or len(columns[0]) < 2
     ):
         return None
     return np.stack(columns, axis=1)

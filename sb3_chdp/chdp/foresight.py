@@ -62,19 +62,22 @@ class ForesightSums(NamedTuple):
 
     def weight(self) -> float:
         """
-        How much what follows is to count in the choice of actions: less than 1 if not even half of what is claimed comes true.
+        How much what follows is to count in the choice of actions: less than 1 if not even half of what is claimed about it
+        comes true, while what is claimed about rewards does. Critics that are wrong about both have no choice to offer.
 
         Least squares of y on both claims: an error about the reward that one about what follows makes up for is none.
 
-        :return: twice the coefficient of f, with the benefit of the doubt, within [0, 1]
+        :return: weight in [0, 1], of the coefficients of r and f, doubled, and with the benefit of the doubt for f
         """
         n, rr, rf, ff, ry, fy, yy = self
         determinant = rr * ff - rf * rf
         if n < MIN_CLAIMS or determinant <= 1e-6 * rr * ff:
             return 1.0
         of_rewards, of_follows = (ff * ry - rf * fy) / determinant, (rr * fy - rf * ry) / determinant
-        error = np.sqrt(max(yy - of_rewards * ry - of_follows * fy, 0) / n * rr / determinant)
-        return float(np.clip(2 * (of_follows + N_ERRORS * error), 0, 1))
+        variance = max(yy - of_rewards * ry - of_follows * fy, 0) / (n * determinant)
+        follows = np.clip(2 * (of_follows + N_ERRORS * np.sqrt(variance * rr)), 0, 1)
+        rewards = np.clip(2 * (of_rewards - N_ERRORS * np.sqrt(variance * ff)), 0, 1)
+        return float(1 - rewards * (1 - follows))
 
 
 def expected_outcomes(policy: CHDPPolicy, features: th.Tensor, rows: np.ndarray) -> th.Tensor:

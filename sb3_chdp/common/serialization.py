@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
+import stable_baselines3.common.sb2_compat.rmsprop_tf_like  # noqa: F401  # files may name its class
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import BaseBuffer
