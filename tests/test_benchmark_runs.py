@@ -86,6 +86,14 @@ def test_a_killed_run_goes_on_to_the_last_bit(algo, tmp_path):
     assert "complete already" in train(run)
 
 
+def test_arguments_of_the_environment_count_in_evaluations_too(tmp_path):
+    run = make_run(tmp_path)
+    manager = RunManager(replace(run, overrides={**run.overrides, "env_kwargs": {"noise": False}}))
+    model = manager.setup_experiment()[0]
+    assert model.env.get_attr("noise") == [False] * 4
+    assert manager.create_envs(1, eval_env=True).get_attr("noise") == [False]
+
+
 def test_damaged_checkpoints_of_a_run(tmp_path):
     run = make_run(tmp_path, n_timesteps=20_000)
     process = started(run)

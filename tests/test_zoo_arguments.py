@@ -63,7 +63,7 @@ def test_no_such_run(logs, command, arguments, message):
         ("enjoy", "--algo=sb3:sac -f logs", "--algo=sac -f logs"),
         ("enjoy", "-f logs", "--algo chdp -f logs"),
         ("plot", "-f sb3_chdp/logs -e sb3_chdp/Goal-v0", "-a chdp -f sb3_chdp/logs -e sb3_chdp-Goal-v0"),
-        ("plot", "--env=lab/A-v0 -o x/y.png", "-a chdp --env=lab-A-v0 -o x/y.png"),
+        ("plot", "-f a/b --env=lab/A-v0 -o x/y.png", "-a chdp -f a/b --env=lab-A-v0 -o x/y.png"),
         ("all_plots", "-f logs -e Goal-v0 -a hppo sb3:sac", "-f logs -e Goal-v0 -a hppo sac"),
         ("plot_from_file", "-i post.pkl", "-i post.pkl"),
     ],
