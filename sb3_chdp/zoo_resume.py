@@ -46,7 +46,8 @@ class ResumableExperimentManager(HybridExperimentManager):
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
         if self.run is None:
             return super()._load_pretrained_agent(hyperparams, env)
-        model = resume(self.run / CHECKPOINTS, env, device=self.device)
+        # The user's own run, which may have classes of the user's
+        model = resume(self.run / CHECKPOINTS, env, device=self.device, trusted=True)
         print(f"Going on at {model.num_timesteps} of {self.n_timesteps} steps")
         return model
 
@@ -83,7 +84,7 @@ def prepare_training(arguments: list[str]) -> list[str]:
 
     :param arguments: those of the script, or ``["--resume", folder of the run]``
     :return: arguments for the script: with ``--resume`` those of the killed run
-    :raises ArgumentsError: for further arguments beside ``--resume``, or a folder without checkpoints
+    :raises ArgumentsError: for further arguments beside ``--resume``, a folder without checkpoints, or a run that is alive
     """
     run = None
     if any(argument.split("=")[0] == "--resume" for argument in arguments):
@@ -93,6 +94,11 @@ def prepare_training(arguments: list[str]) -> list[str]:
         run = Path(parts[1])
         if not (run / ARGUMENTS).is_file() or not CheckpointStore(run / CHECKPOINTS).generations():
             raise ArgumentsError(f"--resume: {run} holds no resumable checkpoint, which train writes with --save-freq")
+        try:
+            # Given back at once: the callback takes it after the files of the run have been opened
+            CheckpointStore(run / CHECKPOINTS).lock()
+        except ValueError as error:
+            raise ArgumentsError(f"--resume: {error}") from error
         arguments = json.loads((run / ARGUMENTS).read_text())
     # The script constructs it
     ResumableExperimentManager.arguments, ResumableExperimentManager.run = arguments, run

@@ -13,8 +13,10 @@ import pytest
 pytest.importorskip("rl_zoo3")
 
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_chdp.cli import prepare_arguments
+from sb3_chdp.common.checkpoint_store import CheckpointStore
 from sb3_chdp.zoo import register
 from sb3_chdp.zoo_resume import prepare_training
 
@@ -76,13 +78,25 @@ def test_a_killed_training_goes_on(tmp_path):
         assert rows[0] == rows[1]
 
 
+class OwnExtractor(FlattenExtractor):
+    """A class that only this module knows."""
+
+
 def test_what_is_kept_of_the_arguments(tmp_path):
-    arguments = new_run(tmp_path)
+    """Also of a model with a class of the user's own, which goes on; not while another process has it."""
+    module = "__import__('tests.test_zoo_resume').test_zoo_resume"
+    own = f"policy_kwargs:dict(net_arch=[8],features_extractor_class={module}.OwnExtractor)"
+    arguments = [own if part.startswith("policy_kwargs:") else part for part in new_run(tmp_path)]
     assert run(arguments, kill_at=60) == -signal.SIGKILL
     folder = tmp_path / "pa_td3" / "Platform-v0_1"
     kept = json.loads((folder / "arguments.json").read_text())
     assert kept[:-1] == [*arguments, "--seed"]
     assert prepare_training(["--resume", str(folder)]) == kept == prepare_training([f"--resume={folder}"])
+    monitor, store = (folder / "0.monitor.csv").read_text(), CheckpointStore(folder / "resumable")
+    store.lock()
+    assert run(["--resume", str(folder)]) == 1 and (folder / "0.monitor.csv").read_text() == monitor
+    del store
+    assert run(["--resume", str(folder)]) == 0
 
 
 def test_wrong_use(tmp_path):

@@ -58,7 +58,8 @@ class RunManager(HybridExperimentManager):
         return None if run.algo.startswith(STOCK) else str(ALGORITHMS[run.algo].hyperparams)
 
     def _load_pretrained_agent(self, hyperparams: dict[str, Any], env: VecEnv) -> BaseAlgorithm:
-        return resume(self.run.checkpoints, env, device=self.device)
+        # The user's own run, which may have classes of the user's
+        return resume(self.run.checkpoints, env, device=self.device, trusted=True)
 
 
 def settings_of(run: Run) -> dict[str, str]:
