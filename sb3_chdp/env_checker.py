@@ -109,8 +109,8 @@ class _Player:
 
     def __init__(self, env: gym.Env, spec: HybridActionSpec):
         self.env, self.spec = env, spec
-        # Steps whose infos say whether they are a success, of all and of the last ones of episodes
-        self.n_steps = self.n_successes = self.n_ends = self.n_successes_at_ends = 0
+        # Ends of episodes, and those whose info says whether it was a success
+        self.n_ends = self.n_successes = 0
         # Length of each random episode, and whether it ended by termination
         self.episodes: list[tuple[int, bool]] = []
         self.overwrites = False
@@ -158,13 +158,11 @@ class _Player:
             if not isinstance(value, bool):
                 raise AssertionError(f"{name} must be a bool, got {value!r}: return bool({name})")
         self._check_info(info, "step()")
-        self.n_steps += 1
-        self.n_successes += "is_success" in info
         if terminated or truncated:
             self.n_ends += 1
-            self.n_successes_at_ends += "is_success" in info
+            self.n_successes += "is_success" in info
         # Monitor and EvalCallback, which read it at the end of episodes, fail when only some report it
-        if self.n_successes_at_ends not in (0, self.n_ends):
+        if self.n_successes not in (0, self.n_ends):
             raise AssertionError(
                 "info['is_success'] must be there at the end of every episode or of none: set it in every step()"
             )
@@ -241,10 +239,6 @@ class _Player:
                     f"All random episodes terminated after {length} steps: if that is a time limit, return truncated=True "
                     "and terminated=False there, so that the future after it counts"
                 )
-        if self.n_successes not in (0, self.n_steps):
-            found.append(
-                "info['is_success'] is there on some steps only: the command line notes success if every step() sets it"
-            )
         if self.overwrites:
             found.append("step() overwrites the observation that it returned before: return a copy, obs.copy()")
         return found

@@ -187,24 +187,22 @@ WARNINGS = {
         lambda: walk(observation=lambda self: np.random.uniform(-1, 1, 2).astype(np.float32)),
         "Two runs with reset(seed=1) and the same actions differ",
     ),
-    "success_at_the_end_only": (
-        lambda: walk(terminated=False, info=lambda self: {"is_success": True} if self.t == 20 else {}),
-        "info['is_success'] is there on some steps only: the command line notes success if every step() sets it",
-    ),
     "overwritten": (lambda: walk(observation=one_array), "overwrites the observation that it returned before: return a copy"),
 }
 
 
-def test_a_sound_environment_is_passed_in_silence():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_hybrid_env(Walk())
+SOUND = {
+    "walk": Walk,
+    "success_at_the_end_only": lambda: walk(terminated=False, info=lambda self: {"is_success": True} if self.t == 20 else {}),
+    "forbidden_actions": MaskedEnv,
+}
 
 
-def test_actions_that_masks_forbid_are_not_taken():
+@pytest.mark.parametrize("name", SOUND)
+def test_a_sound_environment_is_passed_in_silence(name):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_hybrid_env(MaskedEnv())
+        check_hybrid_env(SOUND[name]())
 
 
 @pytest.mark.parametrize("mistake", ERRORS)
