@@ -9,7 +9,8 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from sb3_chdp import ALGORITHMS
 from sb3_chdp.cli import prepare_arguments
 from sb3_chdp.envs.recorder import FrameVideoRecorder
-from tests.test_zoo import TINY, run
+from tests.commands import run
+from tests.test_zoo import TINY
 
 pytest.importorskip("rl_zoo3")
 imageio = pytest.importorskip("imageio")

@@ -13,6 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_chdp import ALGORITHMS
 from sb3_chdp.cli import SCRIPTS
 from sb3_chdp.envs import ENV_IDS
+from tests.commands import run
 
 pytest.importorskip("rl_zoo3")
 optuna = pytest.importorskip("optuna")
@@ -20,15 +21,6 @@ optuna = pytest.importorskip("optuna")
 ENV_ID = "HardMove4-v0"
 TINY = ["-params", "n_envs:2", "learning_starts:20", "n_diffusion_steps:2", "batch_size:8", "buffer_size:500"]
 DEFAULT = next(iter(ALGORITHMS))
-
-
-def run(*arguments, cwd, code=0):
-    environment = {**os.environ, "MPLBACKEND": "Agg", "SDL_VIDEODRIVER": "dummy", "OMP_NUM_THREADS": "1"}
-    result = subprocess.run(
-        [sys.executable, "-m", "sb3_chdp", *arguments], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300
-    )
-    assert result.returncode == code, result.stdout + result.stderr
-    return result.stdout + result.stderr
 
 
 @pytest.fixture(scope="module")
@@ -97,54 +89,6 @@ def test_record(trained):
     assert list((trained / "videos").glob("*.mp4"))
 
 
-OWN_ENV = """
-import gymnasium as gym
-import numpy as np
-from gymnasium.spaces import Box, Discrete, Tuple
-
-
-class OwnEnv(gym.Env):
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
-    action_space = Tuple((Discrete(2), Box(-1, 1, (1,))))
-    observation_space = Box(-1, 1, (2,))
-
-    def __init__(self, render_mode=None):
-        self.render_mode = render_mode
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(2, np.float32), {}
-
-    def step(self, action):
-        return np.zeros(2, np.float32), float(action[1][0]), False, False, {}
-
-    def render(self):
-        return np.zeros((16, 16, 3), np.uint8)
-
-
-gym.register("Own-v0", OwnEnv, max_episode_steps=5)
-"""
-
-
-@pytest.mark.parametrize("algo", ["hppo", "sb3:sac"])
-def test_own_environment(algo, tmp_path):
-    """With every command; its info says nothing about success."""
-    (tmp_path / "mine.py").write_text(OWN_ENV)
-    settings = small("hppo") if algo == "hppo" else small("pa_td3")
-    env = ["--env", "Own-v0", "--gym-packages", "mine"]
-    run("train", "--algo", algo, *env, "-n", "60", "--eval-freq", "30", "--eval-episodes", "2", "-params", *settings,
-        cwd=tmp_path)  # fmt: skip
-    folder = tmp_path / "logs" / algo.removeprefix("sb3:") / "Own-v0_1"
-    for arguments in (["--algo", algo, *env], ["--gym-packages", "mine"]):
-        run("enjoy", *arguments, "--no-render", "-n", "20", cwd=tmp_path)
-        run("record", *arguments, "-n", "5", cwd=tmp_path)
-        assert list(folder.glob("videos/*.mp4"))
-        run("plot", *arguments, "-w", "2", "-o", "plot.png", cwd=tmp_path)
-        run("all_plots", *arguments, "-o", "all.png", cwd=tmp_path)
-    message = run("enjoy", "--no-render", cwd=tmp_path, code=1)
-    assert message == "sb3-chdp enjoy: unknown environment 'Own-v0' (--gym-packages names the module that registers it)\n"
-
-
 def test_optimize_and_train_the_best_trial(trained):
     study = ["--storage", "study.log", "--study-name", "s", "-f", "tuned"]
     run("optimize", "--env", ENV_ID, "-n", "60", "--n-trials", "2", "--n-startup-trials", "1", "--n-evaluations", "1",
@@ -152,14 +96,11 @@ def test_optimize_and_train_the_best_trial(trained):
     run("train", "--env", ENV_ID, "-n", "60", "--eval-freq", "-1", "--trial-id", "1", *study, cwd=trained)
 
 
-OWN = {"chdp": ["n_diffusion_steps:2"], "hyar_td3": ["representation_warmup_steps:5"]}
-
-
 def small(algo):
     """Settings with which an algorithm learns within 60 steps."""
     off_policy = issubclass(ALGORITHMS[algo].load_class(), OffPolicyAlgorithm)
-    shared = ["learning_starts:20", "buffer_size:100"] if off_policy else ["n_steps:5", "batch_size:10"]
-    return [*shared, *OWN.get(algo, [])]
+    settings = ["learning_starts:20", "buffer_size:100"] if off_policy else ["n_steps:5", "batch_size:10"]
+    return [*settings, "representation_warmup_steps:5"] if algo == "hyar_td3" else settings
 
 
 @pytest.mark.parametrize("algo", [name for name in ALGORITHMS if name != DEFAULT])
@@ -230,40 +171,3 @@ def test_yaml_files_are_complete(algorithm):
     assert all(settings[env_id] == settings[f"sb3_chdp/{env_id}"] for env_id in own)
     for env_settings in settings.values():
         assert {"n_timesteps", "policy"} <= set(env_settings)
-
-
-MASKED_ENV = """
-import gymnasium as gym
-import numpy as np
-
-from tests.hybrid_envs import MaskedEnv
-
-
-class MaskedPicture(MaskedEnv):
-    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}
-
-    def __init__(self, render_mode=None):
-        super().__init__()
-        self.render_mode = render_mode
-
-    def render(self):
-        return np.zeros((16, 16, 3), np.uint8)
-
-
-gym.register("Masked-v0", MaskedPicture)
-"""
-
-
-def test_models_are_played_with_masks(tmp_path, monkeypatch):
-    """The environment raises for what it forbids: while it is trained, evaluated, watched, recorded and published."""
-    (tmp_path / "masked.py").write_text(MASKED_ENV)
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
-    run("train", "--env", "Masked-v0", "--gym-packages", "masked", "-n", "60", "--eval-freq", "30", "--eval-episodes", "2",
-        "-params", *small("chdp"), cwd=tmp_path)  # fmt: skip
-    # Three actions, of which most states forbid two: nobody comes through 100 steps by chance
-    assert "10 Episodes" in run("enjoy", "--gym-packages", "masked", "--no-render", "-n", "100", cwd=tmp_path)
-    run("enjoy", "--gym-packages", "masked", "--no-render", "-n", "50", "--n-envs", "2", "--stochastic", cwd=tmp_path)
-    run("record", "--gym-packages", "masked", "-n", "30", cwd=tmp_path)
-    assert list((tmp_path / "logs").glob("*/*/videos/*.mp4"))
-    options = "-orga me --no-upload --eval-episodes 5 -n 20".split()
-    run("push_to_hub", "--gym-packages", "masked", *options, cwd=tmp_path)

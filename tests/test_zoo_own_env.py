@@ -1,0 +1,96 @@
+"""The command line with environments of the user's own."""
+
+import pytest
+
+from tests.commands import run
+
+pytest.importorskip("rl_zoo3")
+
+OWN_ENV = """
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box, Discrete, Tuple
+
+
+class OwnEnv(gym.Env):
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    action_space = Tuple((Discrete(2), Box(-1, 1, (1,))))
+    observation_space = Box(-1, 1, (2,))
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(2, np.float32), float(action[1][0]), False, False, {}
+
+    def render(self):
+        return np.zeros((16, 16, 3), np.uint8)
+
+
+gym.register("Own-v0", OwnEnv, max_episode_steps=5)
+"""
+
+
+@pytest.mark.parametrize(
+    "algo, settings, run_that",
+    [
+        ("hppo", ["n_steps:5", "batch_size:10"], []),
+        ("sb3:sac", ["learning_starts:20", "buffer_size:100"], ["--algo", "sb3:sac", "--env", "Own-v0"]),
+    ],
+    ids=["the last run", "the run that is named"],
+)
+def test_own_environment(algo, settings, run_that, tmp_path):
+    """With every command; its info says nothing about success."""
+    (tmp_path / "mine.py").write_text(OWN_ENV)
+    run("train", "--algo", algo, "--env", "Own-v0", "--gym-packages", "mine", "-n", "60", "--eval-freq", "30",
+        "--eval-episodes", "2", "-params", *settings, cwd=tmp_path)  # fmt: skip
+    folder = tmp_path / "logs" / algo.removeprefix("sb3:") / "Own-v0_1"
+    which = [*run_that, "--gym-packages", "mine"]
+    run("enjoy", *which, "--no-render", "-n", "20", cwd=tmp_path)
+    run("record", *which, "-n", "5", cwd=tmp_path)
+    assert list(folder.glob("videos/*.mp4"))
+    run("plot", *which, "-w", "2", "-o", "plot.png", cwd=tmp_path)
+    run("all_plots", *which, "-o", "all.png", cwd=tmp_path)
+    assert (tmp_path / "plot.png").is_file() and (tmp_path / "all.png").is_file()
+    message = run("enjoy", "--no-render", cwd=tmp_path, code=1)
+    assert message == "sb3-chdp enjoy: unknown environment 'Own-v0' (--gym-packages names the module that registers it)\n"
+
+
+MASKED_ENV = """
+import gymnasium as gym
+import numpy as np
+
+from tests.hybrid_envs import MaskedEnv
+
+
+class MaskedPicture(MaskedEnv):
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}
+
+    def __init__(self, render_mode=None):
+        super().__init__()
+        self.render_mode = render_mode
+
+    def render(self):
+        return np.zeros((16, 16, 3), np.uint8)
+
+
+gym.register("Masked-v0", MaskedPicture)
+"""
+
+
+def test_models_are_played_with_masks(tmp_path):
+    """The environment raises for what it forbids: while it is trained, evaluated, watched, recorded and published."""
+    (tmp_path / "masked.py").write_text(MASKED_ENV)
+    run("train", "--env", "Masked-v0", "--gym-packages", "masked", "-n", "60", "--eval-freq", "30", "--eval-episodes", "2",
+        "-params", "learning_starts:20", "buffer_size:100", "n_diffusion_steps:2", cwd=tmp_path)  # fmt: skip
+    # Three actions, of which most states forbid two: nobody comes through 100 steps by chance
+    assert "10 Episodes" in run("enjoy", "--gym-packages", "masked", "--no-render", "-n", "100", cwd=tmp_path)
+    run("enjoy", "--gym-packages", "masked", "--no-render", "-n", "50", "--n-envs", "2", "--stochastic", cwd=tmp_path)
+    run("record", "--gym-packages", "masked", "-n", "30", cwd=tmp_path)
+    assert list((tmp_path / "logs").glob("*/*/videos/*.mp4"))
+    options = "-orga me --no-upload --eval-episodes 5 -n 20".split()
+    run("push_to_hub", "--gym-packages", "masked", *options, cwd=tmp_path)
