@@ -23,6 +23,7 @@ from sb3_chdp.chdp.paper import PaperPolicy
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.samples import HybridReplaySamples
+from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.registry import ALGORITHMS, Algorithm
 from sb3_chdp.zoo import register
 
@@ -108,9 +109,9 @@ class WithoutCodebook(CHDP):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": OneHotPolicy}
     takes_factored = False
 
-    def _make_hybrid_space(self) -> HybridBox:
-        n_discrete_actions = HybridBox(self.action_space, self.action_layout).spec.n_discrete_actions
-        return HybridBox(self.action_space, self.action_layout, n_discrete_actions, self._mask_parts())
+    def _make_hybrid_space(self, action_layout: str) -> HybridBox:
+        n_discrete_actions = HybridActionSpec(self.action_space, action_layout).n_discrete_actions
+        return HybridBox(self.action_space, action_layout, n_discrete_actions, self._mask_parts())
 
 
 class WithoutSequentialUpdate(CHDP):

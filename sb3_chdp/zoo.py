@@ -83,6 +83,15 @@ class HybridExperimentManager(ExperimentManager):
                 _flatten(settings)
         return hyperparams, saved
 
+    @staticmethod
+    def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:
+        # rl_zoo3 reads schedules of a list of names
+        for name in hyperparams:
+            if name.endswith("_learning_rate"):
+                of_name = ExperimentManager._preprocess_schedules({"learning_rate": hyperparams[name]})
+                hyperparams[name] = of_name["learning_rate"]
+        return ExperimentManager._preprocess_schedules(hyperparams)
+
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         wanted = dict.fromkeys([*self.monitor_kwargs.get("info_keywords", ()), "is_success"])
         present = self._example[1]

@@ -88,7 +88,7 @@ class BitsEnv(gym.Env):
 def test_what_is_factored(space, layout, radices):
     spec = HybridActionSpec(space, layout)
     assert spec.radices == radices and spec.is_factored == (len(radices) > 1)
-    assert spec.row_size == len(radices) + spec.max_parameters
+    assert spec.columns.width == len(radices) + spec.max_parameters
     row = spec.sample_rows(np.random.default_rng(0), 1)[0]
     assert (
         space.contains(spec.to_native(row)) and (spec.to_row(spec.to_native(row))[: len(radices)] == row[: len(radices)]).all()

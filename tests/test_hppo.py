@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
@@ -123,6 +124,26 @@ def test_time_limits_bootstrap(vec_env_cls):
 def test_batch_size_of_one():
     with pytest.raises(ValueError, match="batch_size"):
         make_model(HPPO, make_layout_env(), batch_size=1)
+
+
+def test_a_buffer_that_is_not_hybrid():
+    with pytest.raises(ValueError, match="rollout_buffer_class must be a HybridRolloutBuffer, got"):
+        make_model(HPPO, make_layout_env(), rollout_buffer_class=RolloutBuffer)
+
+
+def test_a_truncated_minibatch():
+    with pytest.warns(UserWarning, match="has only 2 transitions: n_steps \\* n_envs = 10 is no multiple of batch_size=4"):
+        make_model(HPPO, make_layout_env(), n_steps=10, batch_size=4)
+
+
+def test_parameters_of_a_distribution():
+    """SB3's two methods that take the parameters and keep them."""
+    policy = make_model(HPPO, make_layout_env()).policy
+    outputs = policy.action_net(th.rand(5, 8))
+    rows = policy.action_dist.actions_from_params(outputs, policy.log_std, deterministic=True)
+    th.testing.assert_close(rows, policy.action_dist.proba_distribution(outputs, policy.log_std).mode())
+    rows, log_prob = policy.action_dist.log_prob_from_params(outputs, policy.log_std)
+    th.testing.assert_close(log_prob, policy.action_dist.proba_distribution(outputs, policy.log_std).log_prob(rows))
 
 
 def test_masks_are_an_argument_and_no_state():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 
 from sb3_chdp import PDQNTD3
 from tests.algorithms import LAYOUTS, make_model
@@ -87,6 +88,37 @@ def test_passthrough_is_added_and_not_trained():
     assert th.equal(model.actor.passthrough_weight, th.tensor(weight))
     with pytest.raises(ValueError, match=r"passthrough\['bias'\] must have shape \(3,\)"):
         networks(passthrough=dict(bias=[1.0]))
+
+
+def test_passthrough_stays_when_a_model_is_loaded(tmp_path):
+    model, _, _, _ = networks(passthrough=dict(bias=np.full(3, 0.5)))
+    model.save(tmp_path / "model")
+    loaded = PDQNTD3.load(tmp_path / "model", passthrough=dict(bias=np.full(3, 0.5)))
+    assert (loaded.actor.passthrough_bias == 0.5).all()
+    with pytest.raises(ValueError, match="passthrough must stay"):
+        PDQNTD3.load(tmp_path / "model", passthrough=dict(bias=np.zeros(3)))
+
+
+@pytest.mark.parametrize("rate", [-1e-3, np.nan])
+def test_a_schedule_that_leaves_what_is_accepted(rate):
+    model, _, _, _ = networks(actor_learning_rate=lambda _: rate)
+    with pytest.raises(ValueError, match="actor_learning_rate must be a finite number of at least 0, got"):
+        model.learn(40)
+
+
+def test_a_shared_extractor_learns_from_the_actors_loss_alone():
+    env = make_layout_env(observation_space=spaces.Box(0, 255, (36, 36, 1), dtype=np.uint8))
+    policy_kwargs = dict(net_arch=[8], share_features_extractor=True)
+    model = make_model(PDQNTD3, env, "CnnPolicy", policy_kwargs=policy_kwargs).learn(20)
+    weight = next(model.actor.features_extractor.parameters())
+    data = model._sample_batch(8)
+    assert th.autograd.grad(model._critic_loss(data), weight, allow_unused=True) == (None,)
+    assert th.autograd.grad(model._actor_loss(data), weight)[0].any()
+
+
+def test_another_number_of_critics():
+    with pytest.raises(ValueError, match="n_critics must be 2 for PDQN-TD3, got 1"):
+        make_model(PDQNTD3, make_layout_env(), policy_kwargs=dict(n_critics=1))
 
 
 @pytest.mark.parametrize("inverting_gradients", [True, False])

@@ -1,8 +1,11 @@
 """Everything that an SB3 user does with a model, on every layout of hybrid actions."""
 
+from copy import deepcopy
+
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -18,7 +21,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
-from sb3_chdp import CHDP, PATD3, FlattenHybridAction, check_hybrid_env
+from sb3_chdp import CHDP, PATD3, FlattenHybridAction, HyARTD3, check_hybrid_env
 from tests.algorithms import LAYOUTS, OFF_POLICY_ALGORITHMS, has_learnt, make_model, snapshot
 from tests.hybrid_envs import LayoutEnv, box, make_layout_env
 
@@ -136,6 +139,10 @@ def test_dict_and_image_observations(algorithm, policy, share_features_extractor
     ids=lambda kwargs: "-".join(kwargs),  # the same in every worker of pytest-xdist
 )
 def test_off_policy_options(off_policy_algorithm, kwargs):
+    if off_policy_algorithm is HyARTD3 and "optimize_memory_usage" in kwargs:
+        with pytest.raises(ValueError, match="optimize_memory_usage must be False for HyARTD3"):
+            make_model(off_policy_algorithm, make_layout_env(), **kwargs)
+        return
     model = make_model(off_policy_algorithm, make_layout_env(), **kwargs)
     before = snapshot(model)
     model.learn(40)
@@ -161,6 +168,23 @@ def test_training_options(algorithm, kwargs, tmp_path, monkeypatch):
     assert has_learnt(model, before) and model.num_timesteps >= 40
     if "tensorboard_log" in kwargs:
         assert list(tmp_path.glob(f"{algorithm.__name__}_1/events*"))
+
+
+def test_a_frozen_parameter_stays(algorithm):
+    model = make_model(algorithm, make_layout_env())
+    frozen = next(layer.weight for layer in model.policy.modules() if isinstance(layer, th.nn.Linear))
+    frozen.requires_grad_(False)
+    before, first = snapshot(model), frozen.clone()
+    model.learn(30)
+    assert th.equal(frozen, first) and has_learnt(model, before)
+
+
+def test_without_a_seed_random_actions_are_the_users(algorithm):
+    env = make_layout_env()
+    env.action_space.seed(1)
+    expected = deepcopy(env.action_space).sample()
+    make_model(algorithm, env, seed=None)
+    np.testing.assert_equal(env.action_space.sample(), expected)
 
 
 def test_progress_bar(algorithm):

@@ -116,8 +116,8 @@ def test_joint_index_is_a_bijection(radices, seed):
 
 def test_tables():
     spec = HybridActionSpec(layouts()["nested"])
-    assert (spec.n_discrete_actions, spec.max_parameters, spec.n_parameters, spec.row_size) == (3, 2, 3, 3)
-    assert spec.parameter_sizes.tolist() == [2, 1, 0]
+    assert (spec.n_discrete_actions, spec.max_parameters, spec.n_parameters, spec.columns.width) == (3, 2, 3, 3)
+    assert spec.mask.sum(axis=1).tolist() == [2, 1, 0]
     assert spec.mask.tolist() == [[True, True], [True, False], [False, False]]
     assert spec.parameter_index.tolist() == [[0, 1], [2, 0], [0, 0]]
     k, parameters = spec.to_native([1, 0.5, 0.9])
@@ -139,7 +139,7 @@ def test_spellings_of_an_action_without_parameters(empty):
         spaces.OneOf((box(0, 1, 1), empty)),
     ):
         spec = HybridActionSpec(space)
-        assert spec.parameter_sizes.tolist() == [1, 0]
+        assert spec.mask.sum(axis=1).tolist() == [1, 0]
         assert all(space.contains(spec.to_native([k, 0.3])) for k in range(2))
 
 

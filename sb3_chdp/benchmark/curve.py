@@ -5,7 +5,6 @@ import time
 from typing import Any
 
 import numpy as np
-from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
@@ -18,10 +17,10 @@ from sb3_chdp.common.resume import ResumableCheckpoint
 EVAL_SEED = 10_000
 
 
-def gradient_steps_of(model: BaseAlgorithm) -> int:
-    """:return: gradient steps taken so far; SB3's PPO counts epochs instead"""
+def gradient_steps_of(model: Any) -> int:
+    """:return: gradient steps taken so far, those of PPO at most as many: it counts epochs, of which target_kl ends some"""
     n_updates: int = getattr(model, "_n_updates", 0)
-    if isinstance(model, PPO):
+    if hasattr(model, "n_epochs"):
         return n_updates * math.ceil(model.n_steps * model.n_envs / model.batch_size)
     return n_updates
 

@@ -7,6 +7,7 @@ that are not those of the YAML files today.
 """
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +31,15 @@ def load_protocol() -> dict[str, list[Cell]]:
     return protocol
 
 
+@cache
+def _paper_figures() -> dict[str, dict[str, list[float]]]:
+    figures: dict[str, dict[str, list[float]]] = yaml.safe_load(PAPER.read_text())
+    return figures
+
+
 def paper_figure(row: str, env: str) -> tuple[float, float] | None:
     """:return: mean and standard deviation that the paper prints, None if it has none"""
-    figure = yaml.safe_load(PAPER.read_text()).get(env, {}).get(row)
+    figure = _paper_figures().get(env, {}).get(row)
     return None if figure is None else (figure[0], figure[1])
 
 

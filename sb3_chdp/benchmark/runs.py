@@ -90,7 +90,10 @@ class Run:
         return read_rows(self.csv) if self.csv.exists() else []
 
     def evaluation_step(self, index: int, n_timesteps: int) -> int:
-        """:return: environment step of an evaluation, counted from 1; the last one is at the end of the training"""
+        """
+        :return: environment step of an evaluation, counted from 1; without ``eval_freq`` the last one is at the end of the
+            training
+        """
         return index * self.eval_freq if self.eval_freq else max(index * n_timesteps // N_EVALUATIONS, index)
 
     def import_packages(self) -> None:

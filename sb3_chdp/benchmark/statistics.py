@@ -1,8 +1,8 @@
 """
 Scores of runs and what they tell, after Agarwal et al., Deep RL at the Edge of the Statistical Precipice (NeurIPS 2021).
 
-The score of a run is the mean over its last five evaluations: of success, where the environment reports it and a run ever
-succeeds, else of the return.
+The score of a run is the mean over its last five evaluations: of success, where the environment reports it and any run has
+some in these five, else of the return.
 """
 
 from collections.abc import Callable, Sequence

@@ -7,7 +7,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import LinearSchedule, update_learning_rate
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.critic import HybridCritic
@@ -196,10 +196,10 @@ class CHDP(ExploringAlgorithm):
             n_action_candidates=self.n_action_candidates,
         )
 
-    def _make_hybrid_space(self) -> HybridBox:
-        radices = HybridActionSpec(self.action_space, self.action_layout).radices
+    def _make_hybrid_space(self, action_layout: str) -> HybridBox:
+        radices = HybridActionSpec(self.action_space, action_layout).radices
         width = sum(block_widths(radices, self.latent_dim))
-        return HybridBox(self.action_space, self.action_layout, width, self._mask_parts())
+        return HybridBox(self.action_space, action_layout, width, self._mask_parts())
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -318,9 +318,9 @@ class CHDP(ExploringAlgorithm):
         policy = self.policy
         optimizers = [policy.critic.optimizer, policy.discrete_optimizer, policy.continuous_optimizer]
         self._update_learning_rate(optimizers + ([] if policy.reward_optimizer is None else [policy.reward_optimizer]))
-        rate = self.codebook_lr_factor * self.lr_schedule(self._current_progress_remaining)
-        update_learning_rate(policy.codebook_optimizer, rate)
-        self.logger.record("train/codebook_learning_rate", rate)
+        self._update_own_learning_rate(
+            policy.codebook_optimizer, "codebook_learning_rate", lambda left: self.codebook_lr_factor * self.lr_schedule(left)
+        )
 
     def _excluded_save_params(self) -> list[str]:
         parts_of_policy = ["actor", "critic", "actor_target", "critic_target", "update_targets"]

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from gymnasium.utils.env_checker import data_equivalence
 
 # Arithmetic of a training step, relative to that of the default settings, from which on users are told
 COSTLY = 20
@@ -160,6 +161,11 @@ def warn_of_cost(cls: type, **arguments: float) -> None:
         )
 
 
+def _is_same(saved: Any, value: Any) -> bool:
+    # == of arrays, which a dict may hold, is none or many
+    return data_equivalence(saved, value) if isinstance(value, dict) else saved == value
+
+
 def check_load(cls: type, path: Any, saved: Mapping[str, Any], changes: Mapping[str, Any]) -> None:
     """
     :param cls: algorithm that is loaded
@@ -177,5 +183,5 @@ def check_load(cls: type, path: Any, saved: Mapping[str, Any], changes: Mapping[
             raise ValueError(f"load() got the unknown argument {name}={value!r}, {hint} must be one of {arguments}")
         if name in accepted:
             check(accepted[name], **{name: value})
-            if accepted[name].shapes_networks and name in saved and saved[name] != value:
+            if accepted[name].shapes_networks and name in saved and not _is_same(saved[name], value):
                 raise ValueError(f"{name} must stay {saved[name]!r}, for which {path} has networks, got {value!r}")

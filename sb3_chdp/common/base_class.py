@@ -11,7 +11,8 @@ from gymnasium import spaces
 from sb3_contrib.common.maskable.utils import is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.common.vec_env import VecCheckNan, VecEnv, is_vecenv_wrapped
 
 from sb3_chdp.common.arguments import (
@@ -19,6 +20,7 @@ from sb3_chdp.common.arguments import (
     POSITIVE,
     RATE,
     SEED,
+    SWITCH,
     Accepted,
     check,
     check_arguments,
@@ -59,6 +61,7 @@ class HybridAlgorithm(BaseAlgorithm):
         "gamma": FRACTION,
         "max_grad_norm": optional(POSITIVE),
         "action_layout": of_networks(one_of(LAYOUTS)),
+        "use_masking": SWITCH,
         "stats_window_size": whole(1),
         "seed": SEED,
     }
@@ -126,13 +129,16 @@ class HybridAlgorithm(BaseAlgorithm):
         """
         return self.policy.predict(observation, state, episode_start, deterministic, action_masks)  # type: ignore[call-arg]
 
-    def _make_hybrid_space(self) -> HybridBox:
-        """:return: the space of the rows that buffer and networks work with"""
-        return HybridBox(self.action_space, self.action_layout)
+    def _make_hybrid_space(self, action_layout: str) -> HybridBox:
+        """
+        :param action_layout: how to read an ambiguous action space
+        :return: the space of the rows that buffer and networks work with
+        """
+        return HybridBox(self.action_space, action_layout)
 
     def _make_rows(self) -> HybridBox:
         """:return: what :meth:`_make_hybrid_space` makes, with one index for algorithms that need it"""
-        space = self._make_hybrid_space()
+        space = self._make_hybrid_space(self.action_layout)
         if self.takes_factored or not space.spec.is_factored:
             return space
         n_actions = space.spec.n_discrete_actions
@@ -142,11 +148,7 @@ class HybridAlgorithm(BaseAlgorithm):
                 f"{MAX_DISCRETE_ACTIONS} of action_layout='auto' or 'joint': use CHDP, HPPO, PATD3, HHQNTD3 or HyARTD3, which "
                 "take every discrete part as a choice of its own"
             )
-        layout, self.action_layout = self.action_layout, "joint"
-        try:
-            return self._make_hybrid_space()
-        finally:
-            self.action_layout = layout
+        return self._make_hybrid_space("joint")
 
     def _network_kwargs(self) -> dict[str, Any]:
         """:return: arguments of the algorithm that shape its networks, handed to the policy beside ``policy_kwargs``"""
@@ -167,8 +169,9 @@ class HybridAlgorithm(BaseAlgorithm):
             super()._setup_model()  # type: ignore[safe-super]  # of the SB3 algorithm that follows in the MRO
         finally:
             self.action_space, self.policy_kwargs = native_space, policy_kwargs
-        # set_random_seed() seeded the stand-in
-        self.action_space.seed(None if self.seed is None else int(self.seed))
+        if self.seed is not None:
+            # set_random_seed() seeded the stand-in
+            self.action_space.seed(int(self.seed))
 
     def learn(self: SelfHybridAlgorithm, *args: Any, **kwargs: Any) -> SelfHybridAlgorithm:
         """
@@ -193,6 +196,19 @@ class HybridAlgorithm(BaseAlgorithm):
         # What a function gives is known only now
         check(number(), learning_rate=self.lr_schedule(self._current_progress_remaining))
         super()._update_learning_rate(optimizers)
+
+    def _update_own_learning_rate(self, optimizer: th.optim.Optimizer, name: str, schedule: Schedule) -> None:
+        """
+        SB3's ``_update_learning_rate`` for what does not learn at the rate ``learning_rate``.
+
+        :param optimizer: the optimizer
+        :param name: the rate's name, for the log and the message
+        :param schedule: the rate as a function of the remaining progress
+        """
+        rate = schedule(self._current_progress_remaining)
+        check(number(), **{name: rate})
+        update_learning_rate(optimizer, rate)
+        self.logger.record(f"train/{name}", rate)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if self.use_masking and self.env is not None and not is_masking_supported(self.env):

@@ -10,7 +10,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_chdp.common.checks import check_fraction
+from sb3_chdp.common.arguments import FRACTION, check
 
 # Added to every error, so that no transition is forgotten
 PRIORITY_EPSILON = 1e-3
@@ -69,7 +69,7 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         super().__init__(buffer_size, observation_space, *args, **kwargs)
         if self.optimize_memory_usage:
             raise ValueError(f"{type(self).__name__} does not support optimize_memory_usage=True")
-        check_fraction(alpha=alpha, beta=beta)
+        check(FRACTION, alpha=alpha, beta=beta)
         self.alpha, self.beta = alpha, beta
         # Of all places, whether filled or not, and zeros that complete the last block
         size = self.buffer_size * self.n_envs

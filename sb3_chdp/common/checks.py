@@ -1,47 +1,18 @@
 """Checks of arguments and data, whose errors name what was given and what is accepted."""
 
-from collections.abc import Collection
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_chdp.common.arguments import FRACTION, check, constructor_defaults, one_of, whole
+from sb3_chdp.common.arguments import constructor_defaults
 from sb3_chdp.common.space_tree import leaves_of
 
 # What gymnasium.wrappers.FlattenObservation makes a vector of
 FLATTENABLE = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Text, spaces.OneOf)
-
-
 # Numbers that are learnt from: a thousand of them add up to 1e18, whose square float32 still holds. Losses and optimizers
 # compute such squares; beyond them they put out infinity, or learn nothing
 LARGEST = 1e15
-
-
-def check_at_least(least: int, **arguments: int) -> None:
-    """
-    :param least: smallest value that is accepted
-    :param arguments: whole numbers by name
-    :raises ValueError: for the first one that is below
-    """
-    check(whole(least), **arguments)
-
-
-def check_fraction(**arguments: float) -> None:
-    """
-    :param arguments: values by name
-    :raises ValueError: for the first one that is not between 0 and 1
-    """
-    check(FRACTION, **arguments)
-
-
-def check_one_of(accepted: Collection[str], **arguments: str) -> None:
-    """
-    :param accepted: the values that are accepted
-    :param arguments: values by name
-    :raises ValueError: for the first one that is none of them
-    """
-    check(one_of(accepted), **arguments)
 
 
 def check_numbers(name: str, value: Any, first_env: int = 0) -> None:

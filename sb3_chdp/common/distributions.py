@@ -113,6 +113,16 @@ class HybridDistribution(DiagGaussianDistribution):
         """:return: (B, columns) rows of the most probable k and the means"""
         return self._rows(self.categorical.mode(), super().mode())
 
+    def actions_from_params(self, mean_actions: th.Tensor, log_std: th.Tensor, deterministic: bool = False) -> th.Tensor:
+        """:return: (B, columns) rows for the arguments of :meth:`proba_distribution`"""
+        return self.proba_distribution(mean_actions, log_std).get_actions(deterministic)
+
+    def log_prob_from_params(self, mean_actions: th.Tensor, log_std: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """:return: (B, columns) rows for the arguments of :meth:`proba_distribution`, (B, 2) their :meth:`log_prob`"""
+        distribution = self.proba_distribution(mean_actions, log_std)
+        rows = distribution.sample()
+        return rows, distribution.log_prob(rows)
+
     def most_probable(self, outputs: th.Tensor) -> th.Tensor:
         """
         :param outputs: (B, K + P) logits and means

@@ -51,7 +51,6 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         "gradient_steps": whole(-1),
         "optimize_memory_usage": SWITCH,
         "policy_delay": whole(1),
-        "use_masking": SWITCH,
     }
     policy: HybridPolicy
 
@@ -239,10 +238,8 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         rng: np.random.Generator,
         masks: np.ndarray | None,
     ) -> np.ndarray:
-        # Not every policy knows of masks, or needs to
-        of_random = {} if masks is None else {"masks": masks}
         if self.num_timesteps < learning_starts:
-            return self.policy.random_rows(rng, n_envs, **of_random)
+            return self.policy.random_rows(rng, n_envs, masks)
         explores = rng.random(n_envs) < self._exploration_rate()
         noise = self._draw_noise(n_envs) if action_noise is None else action_noise()
         if noise is not None and np.size(noise) != n_envs * self.policy.noise_dim:
@@ -276,7 +273,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         :param masks: (n_envs, K) False for discrete actions that may not be taken, None if all may
         :return: (n, columns) what they do instead: uniformly random actions
         """
-        return self.policy.random_rows(rng, len(rows), **({} if masks is None else {"masks": masks}))[envs]
+        return self.policy.random_rows(rng, len(rows), masks)[envs]
 
     def _store_transition(
         self,

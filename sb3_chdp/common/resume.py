@@ -15,8 +15,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 
+from sb3_chdp.common.arguments import check, whole
 from sb3_chdp.common.checkpoint_store import CheckpointStore, GenerationWriter
-from sb3_chdp.common.checks import check_at_least
 from sb3_chdp.common.env_state import class_names, has_state, restore_env, save_env, warn_of_losses
 from sb3_chdp.common.plain_data import from_bytes, restore_state, to_bytes
 from sb3_chdp.common.replay_store import ReplayStore, buffer_state, read_rows
@@ -70,7 +70,7 @@ class ResumableCheckpoint(BaseCallback):
 
     def __init__(self, save_freq: int, save_path: str | Path, verbose: int = 0):
         super().__init__(verbose)
-        check_at_least(1, save_freq=save_freq)
+        check(whole(1), save_freq=save_freq)
         self.save_freq = save_freq
         self.save_path = Path(save_path)
         self._saved_at = 0  # number of calls

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
-from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, RolloutBufferSamples
 
 
 class HybridRolloutBuffer(RolloutBuffer):
@@ -16,18 +15,10 @@ class HybridRolloutBuffer(RolloutBuffer):
         super().reset()
         self.log_probs = np.zeros((self.buffer_size, self.n_envs, 2), dtype=np.float32)
 
-    def _get_samples(self, *args: Any, **kwargs: Any) -> RolloutBufferSamples:
+    def _get_samples(self, *args: Any, **kwargs: Any) -> Any:
         samples = super()._get_samples(*args, **kwargs)
         return samples._replace(old_log_prob=samples.old_log_prob.view(-1, 2), advantages=samples.advantages[:, None])
 
 
-class HybridDictRolloutBuffer(DictRolloutBuffer):
+class HybridDictRolloutBuffer(HybridRolloutBuffer, DictRolloutBuffer):
     """:class:`HybridRolloutBuffer` for dict observations."""
-
-    def reset(self) -> None:
-        super().reset()
-        self.log_probs = np.zeros((self.buffer_size, self.n_envs, 2), dtype=np.float32)
-
-    def _get_samples(self, *args: Any, **kwargs: Any) -> DictRolloutBufferSamples:  # type: ignore[override]  # as SB3
-        samples = super()._get_samples(*args, **kwargs)
-        return samples._replace(old_log_prob=samples.old_log_prob.view(-1, 2), advantages=samples.advantages[:, None])

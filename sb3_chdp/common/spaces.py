@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_chdp.common.checks import check_one_of
+from sb3_chdp.common.arguments import check, one_of
 from sb3_chdp.common.rows import Array, RowLayout, value_table
 from sb3_chdp.common.space_tree import (
     DiscreteLeaf,
@@ -54,7 +54,7 @@ class HybridActionSpec:
     """
 
     def __init__(self, space: spaces.Space[Any], layout: str = "auto"):
-        check_one_of(LAYOUTS, action_layout=layout)
+        check(one_of(LAYOUTS), action_layout=layout)
         self.space = space
         self.layout = layout
         if isinstance(space, spaces.OneOf):
@@ -133,16 +133,6 @@ class HybridActionSpec:
         self.mask, self.centre, self.half_range, self.parameter_index = (
             np.broadcast_to(table, shape) for table in (mask, centre, half, index)
         )
-
-    @property
-    def row_size(self) -> int:
-        """Length of a row ``[k | scaled parameters]``: 1 + Pmax, L + Pmax if k is made of L choices."""
-        return self.columns.width
-
-    @cached_property
-    def parameter_sizes(self) -> np.ndarray:
-        """(K,) number of parameters of every discrete action, (1,) if it is the same for all of a factored space"""
-        return self.mask.sum(axis=1)
 
     @cached_property
     def choices_of_leaves(self) -> dict[str, slice]:

@@ -15,7 +15,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_chdp.common.arguments import FRACTION, SWITCH, Accepted, number, of_networks, optional
-from sb3_chdp.common.hybrid_box import ScoreBox
+from sb3_chdp.common.hybrid_box import HybridBox, ScoreBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.policies import HybridPolicy
 from sb3_chdp.common.samples import HybridReplaySamples
@@ -49,7 +49,8 @@ class InvertingGradients(nn.Module):
 class HybridTD3Policy(HybridPolicy, TD3Policy):
     """
     SB3's TD3 policy with an actor whose output stands for hybrid actions: the rows of a :class:`ScoreBox`. Subclasses can
-    let it stand for others: by ``_predict`` and ``_noisy_rows``, which return rows, and ``mask_outputs``.
+    let it stand for others: by ``_predict`` and ``_noisy_rows``, which return rows, and ``actor_outputs`` and
+    ``mask_outputs``, which keep to masks.
 
     Arguments not listed here are those of :class:`stable_baselines3.td3.policies.TD3Policy`; ``optimizer_kwargs`` are
     ``fused=True`` for Adam if None.
@@ -131,7 +132,8 @@ class HybridTD3Policy(HybridPolicy, TD3Policy):
 
 class HybridTD3(HybridOffPolicyAlgorithm):
     """
-    Base class of the TD3 baselines. A gradient step is that of SB3's TD3, in parts that subclasses replace.
+    Base class of the TD3 baselines: SB3's TD3 on scores of all discrete actions and their parameters, in parts that
+    subclasses replace.
 
     Parameters not listed here are those of :class:`stable_baselines3.TD3`.
 
@@ -165,6 +167,7 @@ class HybridTD3(HybridOffPolicyAlgorithm):
     # Twin networks, whose inputs are up to the subclasses
     critic: Any
     critic_target: Any
+    takes_factored = True
 
     def __init__(
         self,
@@ -189,10 +192,10 @@ class HybridTD3(HybridOffPolicyAlgorithm):
         exploration_noise: float = 0.1,
         exploration_initial_noise: float | None = None,
         inverting_gradients: bool = False,
-        action_layout: str = "auto",
         exploration_fraction: float = 0.2,
         exploration_initial_eps: float = 1.0,
         exploration_final_eps: float = 0.05,
+        action_layout: str = "auto",
         use_masking: bool | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
@@ -239,6 +242,9 @@ class HybridTD3(HybridOffPolicyAlgorithm):
 
         if _init_setup_model:
             self._setup_model()
+
+    def _make_hybrid_space(self, action_layout: str) -> HybridBox:
+        return ScoreBox(self.action_space, action_layout, self._mask_parts())
 
     def _network_kwargs(self) -> dict[str, Any]:
         return {"inverting_gradients": self.inverting_gradients}

@@ -92,7 +92,7 @@ def gradient_step(
     :param name: name of the loss in the log, for the message
     :raises NonFiniteLossError: before anything moves, if the loss is not finite, or the square of the gradient's norm
     """
-    groups = [[p for group in optimizer.param_groups for p in group["params"]] for optimizer in optimizers]
+    groups = [[p for group in of.param_groups for p in group["params"] if p.requires_grad] for of in optimizers]
     params = [p for group in groups for p in group]
     # Without a gradient: those of a shared features extractor, which belongs to another optimizer's loss
     gradients = th.autograd.grad(loss, params, allow_unused=True)

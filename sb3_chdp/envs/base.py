@@ -1,24 +1,19 @@
 """What the environments share: decoding of actions, reset options, noise draws, states and pictures."""
 
 from collections.abc import Callable
-from math import isfinite
-from numbers import Real
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from sb3_chdp.common.arguments import is_number
+
 if TYPE_CHECKING:
     from sb3_chdp.envs.rendering import Canvas
 
 # Frames after which a step is cut off; never seen
 FRAME_LIMIT = 10_000
-
-
-def is_number(value: Any) -> bool:
-    """:return: whether this is a single finite number, of Python or NumPy"""
-    return isinstance(value, Real) and isfinite(value)
 
 
 class HybridEnv(gym.Env[np.ndarray, Any]):

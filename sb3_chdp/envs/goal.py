@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from gymnasium import spaces
 
-from sb3_chdp.envs.base import FRAME_LIMIT, HybridEnv, is_number
+from sb3_chdp.common.arguments import is_number
+from sb3_chdp.envs.base import FRAME_LIMIT, HybridEnv
 from sb3_chdp.envs.soccer import (
     AREA_DEPTH,
     AREA_HALF_WIDTH,

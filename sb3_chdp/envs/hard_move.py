@@ -13,16 +13,20 @@ if TYPE_CHECKING:
     from sb3_chdp.envs.rendering import Canvas
 
 
+def _directions(n_actuators: int) -> np.ndarray:
+    """:return: (n, 2) unit vectors of the actuators, to three decimals"""
+    angles = 2 * np.pi * np.arange(n_actuators) / n_actuators
+    return np.round(np.stack([np.cos(angles), np.sin(angles)], axis=1), 3)
+
+
 @lru_cache
 def motion_table(n_actuators: int) -> np.ndarray:
     """
     :param n_actuators: number n of actuators
     :return: (2^n, 2) motion of every subset of actuators, the longest of length 1; actuator 0 is the highest bit
     """
-    angles = 2 * np.pi * np.arange(n_actuators) / n_actuators
-    directions = np.round(np.stack([np.cos(angles), np.sin(angles)], axis=1), 3)
     subsets = (np.arange(2**n_actuators)[:, None] >> np.arange(n_actuators)[::-1]) & 1
-    motions = subsets @ directions
+    motions = subsets @ _directions(n_actuators)
     motions = motions / np.linalg.norm(motions, axis=1).max()
     motions.setflags(write=False)
     return motions
@@ -34,8 +38,7 @@ def unit_motions(n_actuators: int) -> np.ndarray:
     :param n_actuators: number n of actuators
     :return: (n, 2) motion of every actuator; with all that point to one side the sum has length 1, and no subset's is longer
     """
-    angles = 2 * np.pi * np.arange(n_actuators) / n_actuators
-    directions = np.round(np.stack([np.cos(angles), np.sin(angles)], axis=1), 3)
+    directions = _directions(n_actuators)
     # The longest sum is of all directions within a quarter turn of its own
     middles = 2 * np.pi * np.arange(4 * n_actuators) / (4 * n_actuators)
     towards = directions @ np.stack([np.cos(middles), np.sin(middles)])

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from sb3_chdp.envs.base import HybridEnv, is_number
+from sb3_chdp.common.arguments import is_number
+from sb3_chdp.envs.base import HybridEnv
 
 if TYPE_CHECKING:
     from sb3_chdp.envs.rendering import Canvas
@@ -170,7 +171,7 @@ class PlatformEnv(HybridEnv):
         outcome = ""
         while True:
             frames += 1
-            standing = y == GROUND and is_standing(x, y)
+            standing = is_standing(x, y)
             if not standing:
                 vy += gravity_step
             elif k == RUN:

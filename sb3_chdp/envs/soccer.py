@@ -95,7 +95,7 @@ def control_player(player: Body, ball: Body, target: tuple[float, float], draws:
         ay = (1 - BALL_DECAY) * (target[1] - player.y) - ball.vy
         efficiency = 1 - 0.25 * abs(wrap(bearing - player.heading)) / pi - 0.25 * distance / KICKABLE
         power = min(hypot(ax, ay) / (efficiency * BALL_MOTION[0]), MAX_POWER) * efficiency
-        heading = player.heading + (atan2(ay, ax) - player.heading)
+        heading = player.heading + (atan2(ay, ax) - player.heading)  # rounded as the original's
         ball.accelerate(power, heading, BALL_MOTION, draws)
     elif abs(wrap(player.heading - bearing)) < pi / 8:
         player.accelerate(10.0, player.heading, PLAYER_MOTION, draws)

@@ -1,5 +1,6 @@
 """Hybrid proximal policy optimization."""
 
+import warnings
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -77,9 +78,9 @@ class HPPO(HybridAlgorithm, PPO):
         :class:`HybridDictRolloutBuffer`. If ``None``, it will be automatically selected.
     :param rollout_buffer_kwargs: Keyword arguments to pass to the rollout buffer on creation
     :param target_kl: Limit the KL divergence between updates, the mean over both heads
+    :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
     :param use_masking: whether to ask the environment for ``action_masks()`` and to take no discrete action that they forbid,
         see :func:`sb3_chdp.common.masks.read_masks`; None: if it has such a method
-    :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
     :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
         the reported success rate, mean episode length, and mean reward over
     :param tensorboard_log: the log location for tensorboard (if None, no logging)
@@ -109,7 +110,6 @@ class HPPO(HybridAlgorithm, PPO):
         "vf_coef": number(),
         "max_grad_norm": POSITIVE,
         "target_kl": optional(POSITIVE),
-        "use_masking": optional(SWITCH),
     }
     policy: HPPOPolicy
     takes_factored = True
@@ -133,8 +133,8 @@ class HPPO(HybridAlgorithm, PPO):
         rollout_buffer_class: type[RolloutBuffer] | None = None,
         rollout_buffer_kwargs: dict[str, Any] | None = None,
         target_kl: float | None = None,
-        use_masking: bool | None = None,
         action_layout: str = "auto",
+        use_masking: bool | None = None,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -181,14 +181,21 @@ class HPPO(HybridAlgorithm, PPO):
         if _init_setup_model:
             self._setup_model()
 
-    def _make_hybrid_space(self) -> HybridBox:
-        return ConcatenatedBox(self.action_space, self.action_layout, ("masks",) if self.use_masking else ())
+    def _make_hybrid_space(self, action_layout: str) -> HybridBox:
+        return ConcatenatedBox(self.action_space, action_layout, ("masks",) if self.use_masking else ())
 
     def _setup_model(self) -> None:
-        if self.rollout_buffer_class is None:
-            is_dict = isinstance(self.observation_space, spaces.Dict)
-            self.rollout_buffer_class = HybridDictRolloutBuffer if is_dict else HybridRolloutBuffer
+        hybrid_class = HybridDictRolloutBuffer if isinstance(self.observation_space, spaces.Dict) else HybridRolloutBuffer
+        self.rollout_buffer_class = self.rollout_buffer_class or hybrid_class
+        if not issubclass(self.rollout_buffer_class, hybrid_class):
+            raise ValueError(f"rollout_buffer_class must be a {hybrid_class.__name__}, got {self.rollout_buffer_class}")
         super()._setup_model()
+        buffer_size = self.n_steps * self.n_envs
+        if buffer_size % self.batch_size > 0:
+            warnings.warn(
+                f"The last minibatch of an epoch has only {buffer_size % self.batch_size} transitions: n_steps * n_envs = "
+                f"{buffer_size} is no multiple of batch_size={self.batch_size}"
+            )
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int

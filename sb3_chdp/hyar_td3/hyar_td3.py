@@ -6,12 +6,13 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
+from stable_baselines3.common.utils import FloatSchedule
 
 from sb3_chdp.common.arguments import RATE, Accepted, of_networks, whole
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.product_table import block_widths
 from sb3_chdp.common.samples import HybridReplaySamples
+from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.common.td3 import HybridTD3
 from sb3_chdp.common.utils import gradient_step
 from sb3_chdp.hyar_td3.policies import CnnPolicy, HyARTD3Policy, MlpPolicy, MultiInputPolicy
@@ -47,7 +48,7 @@ class HyARTD3(HybridTD3):
            additional update per episode.
 
     With n-step returns the representation predicts the change of the state over n steps. Observations other than vectors
-    are represented by the features of the target critic.
+    are represented by the features of the target critic. ``optimize_memory_usage`` is not supported.
 
     The parameters are those of :class:`HybridTD3`, all but the first three by keyword, and
 
@@ -78,7 +79,6 @@ class HyARTD3(HybridTD3):
         "representation_steps": whole(1),
     }
     policy: HyARTD3Policy
-    takes_factored = True
 
     def __init__(
         self,
@@ -122,15 +122,20 @@ class HyARTD3(HybridTD3):
         if _init_setup_model:
             self._setup_model()
 
-    def _make_hybrid_space(self) -> HybridBox:
-        radices = HybridBox(self.action_space, self.action_layout).spec.radices
+    def _make_hybrid_space(self, action_layout: str) -> HybridBox:
+        radices = HybridActionSpec(self.action_space, action_layout).radices
         latent_dim = sum(block_widths(radices, self.embedding_dim)) + self.parameter_latent_dim
-        return HybridBox(self.action_space, self.action_layout, latent_dim, self._mask_parts())
+        return HybridBox(self.action_space, action_layout, latent_dim, self._mask_parts())
 
     def _network_kwargs(self) -> dict[str, Any]:
         return {**super()._network_kwargs(), "embedding_dim": self.embedding_dim}
 
     def _setup_model(self) -> None:
+        if self.optimize_memory_usage:
+            raise ValueError(
+                "optimize_memory_usage must be False for HyARTD3, got True: the representation learns from what follows an "
+                "action, and such a buffer gives the first state of the next episode for what follows the last one"
+            )
         super()._setup_model()
         self.representation_lr_schedule = FloatSchedule(self.representation_learning_rate)
 
@@ -165,7 +170,7 @@ class HyARTD3(HybridTD3):
         :param gradient_steps: number of updates
         """
         optimizer, representation = self.policy.representation_optimizer, self.policy.representation
-        update_learning_rate(optimizer, self.representation_lr_schedule(self._current_progress_remaining))
+        self._update_own_learning_rate(optimizer, "representation_learning_rate", self.representation_lr_schedule)
         losses = []
         for _ in range(gradient_steps):
             loss = representation.loss(self._sample_actions(self.representation_batch_size))

@@ -117,15 +117,20 @@ class ActionRepresentation(nn.Module):
         keep = self.nearest_action(embeddings) == allowed
         return th.where(self.per_column(keep), embeddings, self.embed(allowed))
 
+    def _bounds(self) -> tuple[th.Tensor, th.Tensor]:
+        """:return: centre and half width of the latent bounds"""
+        centre, half_range = (self.latent_high + self.latent_low) / 2, (self.latent_high - self.latent_low) / 2
+        return centre, half_range.clamp(min=MIN_HALF_RANGE)
+
     def scale(self, z: th.Tensor) -> th.Tensor:
         """:return: z with the latent bounds mapped to [-1, 1], clipped"""
-        half = ((self.latent_high - self.latent_low) / 2).clamp(min=MIN_HALF_RANGE)
-        return ((z - (self.latent_high + self.latent_low) / 2) / half).clamp(-1, 1)
+        centre, half_range = self._bounds()
+        return ((z - centre) / half_range).clamp(-1, 1)
 
     def unscale(self, scaled_z: th.Tensor) -> th.Tensor:
         """Inverse of :meth:`scale` inside the bounds."""
-        half = ((self.latent_high - self.latent_low) / 2).clamp(min=MIN_HALF_RANGE)
-        return scaled_z * half + (self.latent_high + self.latent_low) / 2
+        centre, half_range = self._bounds()
+        return scaled_z * half_range + centre
 
     def encode(self, batch: ActionBatch) -> tuple[th.Tensor, th.Tensor]:
         """:return: mean and log standard deviation of z, (B, d2) each"""

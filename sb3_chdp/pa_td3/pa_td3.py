@@ -4,7 +4,6 @@ from typing import ClassVar
 
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_chdp.common.hybrid_box import HybridBox, ScoreBox
 from sb3_chdp.common.td3 import HybridTD3
 from sb3_chdp.pa_td3.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 
@@ -36,8 +35,3 @@ class PATD3(HybridTD3):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
-
-    takes_factored = True
-
-    def _make_hybrid_space(self) -> HybridBox:
-        return ScoreBox(self.action_space, self.action_layout, self._mask_parts())

@@ -5,9 +5,9 @@ from typing import Any, ClassVar
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
-from stable_baselines3.common.utils import FloatSchedule, update_learning_rate
+from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_chdp.common.arguments import RATE, SWITCH, Accepted, of_networks
+from sb3_chdp.common.arguments import RATE, SWITCH, Accepted, of_networks, optional
 from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox
 from sb3_chdp.common.samples import HybridReplaySamples
 from sb3_chdp.common.td3 import HybridTD3
@@ -61,10 +61,15 @@ class PDQNTD3(HybridTD3):
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
     }
-    accepted_arguments: ClassVar[dict[str, Accepted]] = {"actor_learning_rate": RATE, "multi_pass": of_networks(SWITCH)}
+    accepted_arguments: ClassVar[dict[str, Accepted]] = {
+        "actor_learning_rate": RATE,
+        "multi_pass": of_networks(SWITCH),
+        "passthrough": of_networks(optional(Accepted("a dict", lambda value: isinstance(value, dict)))),
+    }
     policy: PDQNTD3Policy
     critic: ParameterizedQNetwork
     critic_target: ParameterizedQNetwork
+    takes_factored = False
 
     def __init__(
         self,
@@ -96,8 +101,8 @@ class PDQNTD3(HybridTD3):
         if _init_setup_model:
             self._setup_model()
 
-    def _make_hybrid_space(self) -> HybridBox:
-        return ConcatenatedBox(self.action_space, self.action_layout, self._mask_parts())
+    def _make_hybrid_space(self, action_layout: str) -> HybridBox:
+        return ConcatenatedBox(self.action_space, action_layout, self._mask_parts())
 
     def _network_kwargs(self) -> dict[str, Any]:
         return {**super()._network_kwargs(), "multi_pass": self.multi_pass, "passthrough": self.passthrough}
@@ -108,9 +113,7 @@ class PDQNTD3(HybridTD3):
 
     def _update_learning_rates(self) -> None:
         self._update_learning_rate(self.critic.optimizer)
-        actor_learning_rate = self.actor_lr_schedule(self._current_progress_remaining)
-        update_learning_rate(self.actor.optimizer, actor_learning_rate)
-        self.logger.record("train/actor_learning_rate", actor_learning_rate)
+        self._update_own_learning_rate(self.actor.optimizer, "actor_learning_rate", self.actor_lr_schedule)
 
     def _next_q_values(self, next_obs: PyTorchObs, next_masks: th.Tensor | None) -> th.Tensor:
         """:return: (B, 1) max_k min_i Q_i(s', x(s') + noise)_k of the targets, k over the allowed actions"""

@@ -71,6 +71,7 @@ class ParameterizedQNetwork(BaseModel):
     :param activation_fn: activation function
     :param normalize_images: whether to divide images by 255
     :param multi_pass: whether to compute the Q-values as MP-DQN
+    :param share_features_extractor: whether the features extractor is the actor's, and learns from the actor's loss alone
     :raises ValueError: for ``multi_pass`` without a hidden layer
     """
 
@@ -88,6 +89,7 @@ class ParameterizedQNetwork(BaseModel):
         activation_fn: type[nn.Module] = nn.ReLU,
         normalize_images: bool = True,
         multi_pass: bool = False,
+        share_features_extractor: bool = False,
     ):
         super().__init__(
             observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
@@ -97,6 +99,7 @@ class ParameterizedQNetwork(BaseModel):
         spec = action_space.spec
         self.features_dim = features_dim
         self.multi_pass = multi_pass
+        self.share_features_extractor = share_features_extractor
         self.q_networks = nn.ModuleList(
             nn.Sequential(*create_mlp(features_dim + spec.n_parameters, spec.n_discrete_actions, net_arch, activation_fn))
             for _ in range(2)
@@ -106,7 +109,8 @@ class ParameterizedQNetwork(BaseModel):
 
     def features(self, obs: PyTorchObs) -> th.Tensor:
         """:return: (B, features_dim) features of the observations"""
-        return self.extract_features(obs, self.features_extractor)
+        with th.set_grad_enabled(th.is_grad_enabled() and not self.share_features_extractor):
+            return self.extract_features(obs, self.features_extractor)
 
     def forward(self, features: th.Tensor, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -199,8 +203,9 @@ class PDQNTD3Policy(HybridTD3Policy):
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> Any:
         critic_kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        for name in ("n_critics", "share_features_extractor"):  # always two; the actor's loss spares the extractor
-            del critic_kwargs[name]
+        n_critics = critic_kwargs.pop("n_critics")
+        if n_critics != 2:
+            raise ValueError(f"n_critics must be 2 for PDQN-TD3, got {n_critics}")
         return ParameterizedQNetwork(**critic_kwargs, multi_pass=self.multi_pass).to(self.device)
 
     def _predict(
