@@ -35,7 +35,7 @@ lint: $(STAMP)
 	$(BIN)/ruff check $(SOURCES)
 
 type: $(STAMP)
-	$(BIN)/mypy sb3_chdp
+	$(BIN)/mypy
 
 docs: $(STAMP)
 	$(BIN)/mkdocs build --strict

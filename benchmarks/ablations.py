@@ -15,8 +15,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import create_mlp, get_actor_critic_arch
 from torch import nn
 
-from sb3_chdp import CHDP
-from sb3_chdp.chdp import PaperCHDP
+from sb3_chdp.chdp import CHDP, PaperCHDP
 from sb3_chdp.chdp.codebook import Codebook
 from sb3_chdp.chdp.diffusion import DiffusionModel
 from sb3_chdp.chdp.paper import PaperPolicy

@@ -12,7 +12,8 @@ vCPUs, Python 3.11.7): read those ratios as orders of magnitude.
 import argparse
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -55,15 +56,15 @@ class ManyActions(gym.Env):
         self.observation_space = spaces.Box(-1.0, 1.0, (4,), dtype=np.float32)
         self.action_space = spaces.Tuple((spaces.Discrete(n_actions), spaces.Box(-1.0, 1.0, (1,))))
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
         return self.np_random.uniform(-1, 1, 4).astype(np.float32), {}
 
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         return self.reset()[0], 0.0, False, False, {}
 
 
-def off_policy() -> dict[str, type[OffPolicyAlgorithm]]:
+def off_policy() -> dict[str, type[Any]]:
     """:return: the off-policy algorithms by their display names"""
     classes = {algorithm.display_name: algorithm.load_class() for algorithm in ALGORITHMS.values()}
     return {name: algorithm for name, algorithm in classes.items() if issubclass(algorithm, OffPolicyAlgorithm)}
@@ -108,7 +109,7 @@ def conversion(repeats: int) -> Iterator[str]:
     for name, space in cases.items():
         spec = HybridActionSpec(space)
         rows = spec.sample_rows(np.random.default_rng(0), 8)
-        (seconds,) = medians([lambda s=spec, r=rows: s.to_native_batch(r)], 20 * repeats)
+        (seconds,) = medians([partial(spec.to_native_batch, rows)], 20 * repeats)
         yield f"| {name} | {seconds / 8 * 1e6:.0f} |"
 
 
@@ -122,7 +123,7 @@ def step(repeats: int, device: str) -> Iterator[str]:
         ("PaperCHDP", PaperCHDP, 1, {}),
     ]
     models = [build(algorithm, device=device, **kwargs) for _, algorithm, _, kwargs in cases]
-    seconds = medians([lambda m=m, n=case[2]: m.train(n, 128) for m, case in zip(models, cases, strict=True)], repeats)
+    seconds = medians([partial(m.train, case[2], 128) for m, case in zip(models, cases, strict=True)], repeats)
     per_step = [value / case[2] for value, case in zip(seconds, cases, strict=True)]
     yield "| gradient step | ratio to TD3 | milliseconds |\n|---|---|---|"
     for (name, *_), value in zip(cases, per_step, strict=True):
@@ -151,7 +152,7 @@ def matrix_products(repeats: int) -> Iterator[str]:
             for a, b in products:
                 th.mm(a, b)
 
-        whole, floor = medians([lambda m=model, b=batch_size: m.train(2, b), only_products], repeats)
+        whole, floor = medians([partial(model.train, 2, batch_size), only_products], repeats)
         label = f"{name}, batch {batch_size}: {len(products)} products"
         yield f"| {label} | {1e3 * whole:.1f} | {1e3 * floor:.1f} | {whole / floor:.1f} |"
 
@@ -164,7 +165,7 @@ def predict(repeats: int, device: str) -> Iterator[str]:
     cases = [(chdp, False), (chdp, True), (paper, True), (td3, True)]
     for n in (1, 8, 64):
         obs = np.random.default_rng(0).uniform(-1, 1, (n, 4)).astype(np.float32)
-        seconds = medians([lambda m=m, d=d, o=obs: m.predict(o, deterministic=d) for m, d in cases], repeats)
+        seconds = medians([partial(m.predict, obs, deterministic=d) for m, d in cases], repeats)
         yield f"| {n} | " + " | ".join(f"{1e3 * value:.2f}" for value in seconds) + " |"
 
 
@@ -172,22 +173,22 @@ def discrete_actions(repeats: int, device: str) -> Iterator[str]:
     """(d) number of discrete actions, CHDP's defaults"""
     yield "| K | gradient step, ms | ratio to K = 4 |\n|---|---|---|"
     sizes = (4, 64, 1024, 65_536)
-    models = [build(CHDP, lambda k=k: ManyActions(k), device=device) for k in sizes]
-    seconds = medians([lambda m=m: m.train(2, 128) for m in models], repeats)
+    models = [build(CHDP, partial(ManyActions, k), device=device) for k in sizes]
+    seconds = medians([partial(m.train, 2, 128) for m in models], repeats)
     for k, value in zip(sizes, seconds, strict=True):
         yield f"| {k:,} | {1e3 * value / 2:.1f} | {value / seconds[0]:.2f} |"
 
 
 def baselines(repeats: int, device: str) -> Iterator[str]:
     """(g) gradient step of every algorithm; networks of 2 x 256, batch 128 (CHDP, PaperCHDP: their defaults)"""
-    rows: list[tuple[str, Callable[[], object], int]] = []
-    settings = dict(policy_kwargs=dict(net_arch=[256, 256]), device=device)
+    rows: list[tuple[str, Any, int]] = []
+    settings: dict[str, Any] = dict(policy_kwargs=dict(net_arch=[256, 256]), device=device)
     rows.append(("SB3's TD3", build(TD3, wrapper=FlattenHybridAction, **settings), 2))
     others = {name: algorithm for name, algorithm in off_policy().items() if not issubclass(algorithm, CHDP)}
     rows += [(name, build(algorithm, **settings), 2) for name, algorithm in others.items()]
     rows.append(("PDQN-TD3, multi_pass", build(PDQNTD3, multi_pass=True, **settings), 2))
     rows += [("CHDP", build(CHDP, device=device), 2), ("PaperCHDP", build(PaperCHDP, device=device), 1)]
-    seconds = medians([lambda m=model, n=n: m.train(n, 128) for _, model, n in rows], repeats)  # type: ignore[attr-defined]
+    seconds = medians([partial(model.train, n, 128) for _, model, n in rows], repeats)
     per_step = [value / n for value, (_, _, n) in zip(seconds, rows, strict=True)]
     env = make_vec_env(ENV_ID, 8, seed=0)
     hppo = HPPO("MlpPolicy", env, n_steps=128, n_epochs=1, seed=0, **settings)

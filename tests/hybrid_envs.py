@@ -27,6 +27,11 @@ def layouts() -> dict[str, spaces.Space]:
     }
 
 
+def gym_make(env_id: str, **kwargs: Any) -> Any:
+    """:return: the environment, as Any: it and its wrappers have methods that ``gym.Env`` has not"""
+    return gym.make(env_id, **kwargs)
+
+
 class LayoutEnv(gym.Env):
     """
     Random observations; an action outside of the action space is an error.

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -95,7 +96,7 @@ def trained(folder, total=60, n_envs=1, save_freq=10, checkpoint=ResumableCheckp
 
 
 # Algorithm, number of environments and settings: each setting that has a state of its own is on in one of them
-RUNS = {
+RUNS: dict[str, dict[str, Any]] = {
     "CHDP-1": {},
     "CHDP-4": dict(n_steps=3),
     "PaperCHDP-1": dict(n_diffusion_steps=2),
@@ -176,7 +177,8 @@ def result(model, env, folder):
         add("buffer", {k: v for k, v in public.items() if isinstance(v, (np.ndarray, int, float, bool))})
     add("num_timesteps", model.num_timesteps)
     add("environments", env.env_method("get_state"))
-    add("generators", [th.get_rng_state(), np.random.get_state()[1], str(model.action_space.np_random.bit_generator.state)])
+    of_actions = model.action_space.np_random.bit_generator.state
+    add("generators", [th.get_rng_state(), np.random.get_state(legacy=False), of_actions])
     for path in sorted([*(folder / "monitor").glob("*.csv"), *(folder / "log").iterdir()]):
         for i, row in enumerate(_rows(path)):
             for key, value in row.items():

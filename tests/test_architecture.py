@@ -20,7 +20,7 @@ def imports_of(name):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{name}: imports are absolute"
+            assert node.level == 0 and node.module, f"{name}: imports are absolute"
             # What is imported from a package may be a module of it
             inner = {f"{node.module}.{alias.name}" for alias in node.names}
             found |= (inner & MODULES.keys()) or {node.module}

@@ -1,6 +1,7 @@
 """Arguments out of range are refused, by every algorithm that has them, with what was given and what is accepted."""
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -175,7 +176,7 @@ def test_arguments_of_the_algorithm_in_policy_kwargs(algorithm, name, value):
         make_model(algorithm, make_layout_env(), policy_kwargs={name: value})
 
 
-OTHERS = {
+OTHERS: dict[str, dict[str, Any]] = {
     "class": dict(replay_buffer_class=PrioritizedReplayBuffer),
     "observation_space": dict(env=make_layout_env(observation_space=box(-2, 2, 2))),
     "action_space": dict(env=make_layout_env("flat")),

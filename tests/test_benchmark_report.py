@@ -13,6 +13,7 @@ pytest.importorskip("rliable")
 from sb3_chdp import ALGORITHMS
 from sb3_chdp.benchmark import figures, paper, tables
 from sb3_chdp.benchmark.results import FIELDS, ResultsError, differences, read_results
+from sb3_chdp.benchmark.runs import display_name
 from sb3_chdp.benchmark.statistics import iqm, matrix_of, probability_of_improvement, scores_of
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
@@ -58,10 +59,10 @@ def test_one_algorithm_without_success_is_compared_by_return():
 def test_intervals_are_reproducible_and_hold_the_point():
     scores = np.random.default_rng(0).normal(90, 5, 20)
     np.random.seed(1)
-    state = np.random.get_state()[1].copy()
+    state = np.random.get_state(legacy=False)
     middle, low, high = iqm(scores)
     assert low < middle < high
-    assert np.array_equal(np.random.get_state()[1], state), "the caller's random numbers are left alone"
+    np.testing.assert_equal(np.random.get_state(legacy=False), state, "the caller's random numbers are left alone")
     assert iqm(scores + 0.0) == (middle, low, high)
 
 
@@ -123,7 +124,7 @@ def test_differences_of_settings():
 
 
 def test_names_of_rows():
-    assert [tables.display_name(name) for name in ("chdp", "sb3:sac", "without_codebook")] == [
+    assert [display_name(name) for name in ("chdp", "sb3:sac", "without_codebook")] == [
         "CHDP", "SAC, flattened", "without codebook",
     ]  # fmt: skip
 

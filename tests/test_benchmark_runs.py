@@ -9,11 +9,14 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("submitit")
+
+from submitit.core.utils import FailedJobError, UncompletedJobError
 
 from sb3_chdp.benchmark import jobs
 from sb3_chdp.benchmark.manager import RunManager, settings_of
@@ -24,7 +27,7 @@ from sb3_chdp.benchmark.training import forget, train
 ENV_ID = "HardMove4-v0"
 ROOT = Path(__file__).parent.parent
 OFF_POLICY = dict(n_envs=4, learning_starts=40, buffer_size=400, gradient_steps=1)
-TINY = {
+TINY: dict[str, dict[str, Any]] = {
     "chdp": dict(OFF_POLICY, n_diffusion_steps=2, n_action_candidates=2, policy_kwargs="dict(net_arch=[32, 32])"),
     "hppo": dict(n_envs=4, n_steps=10, batch_size=20, n_epochs=2),
     "pdqn_td3": OFF_POLICY,
@@ -88,7 +91,7 @@ def test_a_killed_run_goes_on_to_the_last_bit(algo, tmp_path):
 
 def test_arguments_of_the_environment_count_in_evaluations_too(tmp_path):
     run = make_run(tmp_path)
-    manager = RunManager(replace(run, overrides={**run.overrides, "env_kwargs": {"noise": False}}))
+    manager: Any = RunManager(replace(run, overrides={**run.overrides, "env_kwargs": {"noise": False}}))
     model = manager.setup_experiment()[0]
     assert model.env.get_attr("noise") == [False] * 4
     assert manager.create_envs(1, eval_env=True).get_attr("noise") == [False]
@@ -279,7 +282,7 @@ def test_bad_arguments(options, message, capsys):
 
 
 def test_reason_of_a_failure():
-    assert "killed" in jobs.reason(jobs.submitit.core.utils.UncompletedJobError("no output"))
+    assert "killed" in jobs.reason(UncompletedJobError("no output"))
     ruler = "----------------------"
     trace = f"Job failed with trace:\n{ruler}\nTraceback\n  File\nValueError: too big\n\n{ruler}\nlogs"
-    assert jobs.reason(jobs.submitit.core.utils.FailedJobError(trace)) == "ValueError: too big"
+    assert jobs.reason(FailedJobError(trace)) == "ValueError: too big"

@@ -1,5 +1,7 @@
 """Learning over several steps, where values of next states decide."""
 
+from typing import Any
+
 import pytest
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -8,7 +10,7 @@ from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3, PDQNTD3, HyARTD3
 from tests.hybrid_envs import HybridChainEnv
 
 TD3 = dict(gradient_steps=8, learning_rate=1e-3, learning_starts=400, policy_kwargs=dict(net_arch=[64, 64]))
-SETTINGS = {
+SETTINGS: dict[type, dict[str, Any]] = {
     CHDP: dict(n_diffusion_steps=5, gradient_steps=4, learning_starts=400, policy_kwargs=dict(net_arch=[64, 64])),
     PATD3: TD3,
     HHQNTD3: TD3,

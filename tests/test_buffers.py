@@ -1,5 +1,7 @@
 """Prioritised replay: what is drawn, how often, and what becomes of the priorities."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch as th
@@ -98,11 +100,12 @@ def test_dict_observations_need_the_buffer_for_dicts():
 
 
 def test_observations_in_a_dict_are_normalised():
-    env = VecNormalize(make_vec_env(lambda: HybridIdentityEnv(), 2), norm_reward=False)
+    env: Any = VecNormalize(make_vec_env(lambda: HybridIdentityEnv(), 2), norm_reward=False)
     env.obs_rms.mean, env.obs_rms.var = np.full(4, 2.0), np.full(4, 4.0)
     plain = PrioritizedReplayBuffer(20, env.observation_space, spaces.Box(-1, 1, (1,)), "cpu", n_envs=2)
     plain.add(np.full((2, 4), 6.0), np.zeros((2, 4)), np.zeros((2, 1)), np.zeros(2), np.zeros(2), [{}] * 2)
-    np.testing.assert_allclose(plain.sample(3, env).observations, 2.0, rtol=1e-6)
+    batch: Any = plain.sample(3, env)
+    np.testing.assert_allclose(batch.observations, 2.0, rtol=1e-6)
 
     space = spaces.Dict(a=BOX, b=spaces.Box(0, 1, (3,)))
     buffer = PrioritizedDictReplayBuffer(20, space, spaces.Box(-1, 1, (1,)), "cpu", n_envs=2)

@@ -6,6 +6,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_chdp.chdp.candidates import FixedDraws, SelectedActions, Selection, refined
+from sb3_chdp.chdp.critic import HybridCritic
 from tests.algorithms import calls_of, filled_model
 from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, make_layout_env
 
@@ -19,10 +20,11 @@ KINDS = {
 SELECTIONS = pytest.mark.parametrize("select", KINDS.values(), ids=KINDS)
 
 
-class Critic:
+class Critic(HybridCritic):
     """Two value functions of the actions, which notes the candidates that it is asked about."""
 
     def __init__(self, q1, q2=None):
+        th.nn.Module.__init__(self)
         self.q1, self.q2, self.asked = q1, q2 or q1, []
 
     def scores(self, features, latents, parameters):
@@ -191,7 +193,8 @@ def test_predictions_are_the_best_candidates(deterministic):
     model = filled_model(n_action_candidates=8)
     obs = np.random.uniform(-1, 1, (6, 4)).astype(np.float32)
     columns, q_networks = model.hybrid_space.columns, model.critic_target.q_networks
-    calls, outputs = calls_of(q_networks[0]), [[], []]
+    calls = calls_of(q_networks[0])
+    outputs: tuple[list, list] = ([], [])
     for network, values in zip(q_networks, outputs, strict=True):
         network.register_forward_hook(lambda module, args, q, values=values: values.append(q.detach()))
     rows = model.policy.predict_rows(obs, deterministic)

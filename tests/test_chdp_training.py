@@ -18,10 +18,8 @@ from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, make_layout_env
 
 def online_and_target(model):
     """:return: pairs of parameters"""
-    pairs = []
-    for online, target in ((model.actor, model.actor_target), (model.critic, model.critic_target)):
-        pairs += zip(online.parameters(), target.parameters(), strict=True)
-    return pairs
+    networks = (model.actor, model.actor_target), (model.critic, model.critic_target)
+    return [pair for online, target in networks for pair in zip(online.parameters(), target.parameters(), strict=True)]
 
 
 def test_stored_latents_are_relabelled():
@@ -88,12 +86,18 @@ def test_time_limits_bootstrap_and_terminations_do_not(episode_end, bootstraps):
 
 def test_the_learning_rate_falls_to_zero_by_default():
     model = CHDP("MlpPolicy", HybridIdentityEnv(), learning_starts=0, codebook_lr_factor=0.5, seed=0, n_diffusion_steps=1)
-    policy, rates = model.policy, []
+    policy = model.policy
     of_networks = (policy.critic.optimizer, policy.reward_optimizer, policy.discrete_optimizer, policy.continuous_optimizer)
     optimizers = (*of_networks, policy.codebook_optimizer)
+    noted: list[list[float]] = []
+
+    def note(*_):
+        noted.append([o.param_groups[0]["lr"] for o in optimizers])
+        return True
+
     # The callback comes before the training of its step
-    model.learn(21, callback=lambda *_: rates.append([o.param_groups[0]["lr"] for o in optimizers]) is None)
-    rates = np.array(rates)[1:]
+    model.learn(21, callback=note)
+    rates = np.array(noted)[1:]
     np.testing.assert_allclose(rates / rates[:, :1], [[1, 1, 1, 1, 0.5]] * len(rates))
     np.testing.assert_allclose(np.diff(rates[:, 0]), -rates[0, 0] / len(rates), rtol=1e-6)
 

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +37,7 @@ def test_buffer_and_counters_agree(n_envs, train_freq, tmp_path):
             return self.n_calls < 17
 
     model.learn(1000, [ResumableCheckpoint(5, tmp_path), Kill()])
-    resumed = resume(tmp_path, make_env(n_envs))
+    resumed: Any = resume(tmp_path, make_env(n_envs))
     assert resumed.num_timesteps == 15 * n_envs == resumed.replay_buffer.size() * n_envs
     # What the stopping callback kept from the buffer is not part of a checkpoint
     before = {1: 10, 3: 12}[train_freq] * n_envs
@@ -98,7 +99,8 @@ def test_training_goes_on_after_a_damaged_checkpoint(tmp_path):
 
 def test_only_new_rows_are_written(tmp_path):
     """A file of transitions that is not new has the time and the place on the disk of an earlier one."""
-    seen, written = set(), {}
+    seen: set[tuple[int, int]] = set()
+    written: dict[str, int] = {}
 
     class Watch(BaseCallback):
         def _on_step(self):
@@ -117,7 +119,8 @@ def test_only_new_rows_are_written(tmp_path):
     assert max(counts[5:]) < 25 < counts[1] * 10
     inodes = [{path.stat().st_ino for path in folder.rglob("*.npy")} for folder in generations(tmp_path)]
     assert not set.intersection(*inodes), "what damages one generation spares the other"
-    np.testing.assert_array_equal(resume(tmp_path, make_env(2)).replay_buffer.observations, model.replay_buffer.observations)
+    resumed: Any = resume(tmp_path, make_env(2))
+    np.testing.assert_array_equal(resumed.replay_buffer.observations, model.replay_buffer.observations)
 
 
 @pytest.mark.parametrize("chunk_bytes", [1, 300])
@@ -129,7 +132,8 @@ def test_rows_are_those_of_the_buffer_wherever_it_stands(chunk_bytes, frugal, tm
     store = replay_store.ReplayStore(chunk_bytes)
     for i in range(60):
         for _ in range(rng.integers(0, 5)):
-            buffer.add(*rng.uniform(-1, 1, (3, 1, 2)), rng.normal(size=1), rng.integers(0, 2, 1), [{}])
+            obs, next_obs, action = rng.uniform(-1, 1, (3, 1, 2))
+            buffer.add(obs, next_obs, action, rng.normal(size=1), rng.integers(0, 2, 1), [{}])
             store.n_added += 1
         writer = GenerationWriter(tmp_path / str(i))
         writer.folder.mkdir()

@@ -7,7 +7,7 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_chdp.chdp.diffusion import DiffusionModel, NoiseSchedule
+from sb3_chdp.chdp.diffusion import DiffusionModel, NoisePredictor, NoiseSchedule
 
 
 def betas_of(n_steps):
@@ -31,11 +31,11 @@ def test_schedule_by_hand():
     np.testing.assert_allclose(schedule.mean_x, [0.0, (1 - abar_1) * np.sqrt(1 - beta_2) / (1 - abar_2)])
 
 
-class KnownNoise(nn.Module):
+class KnownNoise(NoisePredictor):
     """Predicts what :meth:`DiffusionModel.sample` ought to take away: a function of x_i and the step, given as a tensor."""
 
     def __init__(self, predict, n_steps):
-        super().__init__()
+        nn.Module.__init__(self)
         self.predict, self.n_steps = predict, n_steps
 
     def contexts(self, condition):

@@ -1,6 +1,7 @@
 """The mistakes that users make in their environments, and what they are told to do about each."""
 
 import warnings
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -11,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_chdp import CHDP, ScalarBoxes, check_hybrid_env
 from tests.hybrid_envs import LayoutEnv, MaskedEnv, box, layouts
 
-ACTIONS = layouts()["shared"]
+ACTIONS: Any = layouts()["shared"]
 PLANE = box(-1, 1, 2)
 
 

@@ -2,14 +2,13 @@
 
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
-import sb3_chdp  # noqa: F401
+from tests.hybrid_envs import gym_make
 
 DATA = Path(__file__).parent / "data"
-FILES = {
+FILES: dict[str, tuple[str, dict]] = {
     "platform": ("Platform-v0", {}),
     "goal": ("Goal-v0", {}),
     "hard_goal": ("HardGoal-v0", {}),
@@ -43,7 +42,7 @@ def values(env, names):
 def test_golden_transitions(name):
     env_id, kwargs = FILES[name]
     golden = dict(np.load(DATA / f"{name}.npz"))  # a dict: the archive unpacks at every access
-    env = gym.make(f"sb3_chdp/{env_id}", noise=False, **kwargs).unwrapped
+    env = gym_make(f"sb3_chdp/{env_id}", noise=False, **kwargs).unwrapped
     names = golden["state_names"].tolist()
     assert set(env.get_state()) == {*names, "np_random"}
     tolerance, obs_tolerance = TOLERANCES.get(name, (1e-9, 1e-6))
@@ -69,7 +68,7 @@ def test_golden_transitions(name):
 
 
 def test_step_limits_truncate():
-    env = gym.make("HardMove4-v0")
+    env = gym_make("HardMove4-v0")
     env.reset(seed=0)
     action = (0, [np.zeros(1, dtype=np.float32)] * 16)
     for t in range(1, 31):
@@ -78,7 +77,7 @@ def test_step_limits_truncate():
 
 
 def test_goal_terminates_at_its_own_limit():
-    env = gym.make("Goal-v0")
+    env = gym_make("Goal-v0")
     env.reset(seed=0)
     env.unwrapped.set_state({"time": 99})
     _, reward, terminated, truncated, info = env.step(env.action_space.sample())
@@ -88,8 +87,8 @@ def test_goal_terminates_at_its_own_limit():
 def test_fixed_intervals_of_hard_goal():
     """A shot goes to where Goal's own shot at the recorded height goes."""
     golden = np.load(DATA / "hard_goal.npz")
-    hard_goal = gym.make("HardGoal-v0", fixed_intervals=True, noise=False)
-    goal = gym.make("Goal-v0", noise=False)
+    hard_goal = gym_make("HardGoal-v0", fixed_intervals=True, noise=False)
+    goal = gym_make("Goal-v0", noise=False)
     hard_goal.reset(seed=0)
     goal.reset(seed=0)
     names = golden["state_names"].tolist()
@@ -112,12 +111,12 @@ def test_motion_table(n):
 def test_resets():
     resets = np.load(DATA / "resets.npz")
     names = np.load(DATA / "goal.npz")["state_names"].tolist()
-    env = gym.make("Goal-v0")
+    env = gym_make("Goal-v0")
     for state, expected in zip(resets["goal.state"], resets["goal.obs"], strict=True):
         obs, _ = env.reset(options={"start": state[1]})
         np.testing.assert_allclose(values(env, names), state, atol=1e-12)
         np.testing.assert_allclose(obs, expected, atol=1e-6)
     names = np.load(DATA / "platform.npz")["state_names"].tolist()
-    platform = gym.make("Platform-v0")
+    platform = gym_make("Platform-v0")
     np.testing.assert_allclose(platform.reset(seed=3)[0], resets["platform.obs"][0], atol=1e-6)
     np.testing.assert_array_equal(values(platform, names), resets["platform.state"][0])

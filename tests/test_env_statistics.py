@@ -2,14 +2,13 @@
 
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.stats import ks_2samp
 
-import sb3_chdp  # noqa: F401
 from sb3_chdp import HybridActionSpec
 from sb3_chdp.envs.hard_move import motion_table
+from tests.hybrid_envs import gym_make
 
 DATA = Path(__file__).parent / "data"
 STATISTICS = np.load(DATA / "stats_noise.npz")
@@ -85,7 +84,7 @@ POLICIES = {
 
 def play(name, n_episodes, seed=1):
     """:return: (n_episodes, 4) return, success, length and frames of the episodes of one policy"""
-    env = gym.make(IDS[name.split(".")[0]])
+    env = gym_make(IDS[name.split(".")[0]])
     spec = HybridActionSpec(env.action_space)
     rng = np.random.default_rng(seed)
     policy = POLICIES[name]
@@ -126,7 +125,7 @@ def test_outcomes(name):
 
 @pytest.mark.parametrize("case", [f"{name}.{i}" for name in ("platform", "goal") for i in range(8)])
 def test_noise_moments(case):
-    env = gym.make(IDS[case.split(".")[0]]).unwrapped
+    env = gym_make(IDS[case.split(".")[0]]).unwrapped
     env.reset(seed=2)
     names = np.load(DATA / f"{case.split('.')[0]}.npz")["state_names"].tolist()
     state, k = dict(zip(names, MOMENTS[f"{case}.state"], strict=True)), int(MOMENTS[f"{case}.k"])

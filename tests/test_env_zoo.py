@@ -1,5 +1,7 @@
 """rl_zoo3's scripts with the ids of this package, which contain a slash, and videos of the frames inside a step."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import yaml
@@ -51,7 +53,7 @@ def test_recorder(env_id, n_envs, tmp_path, monkeypatch):
     vec_env_cls = SubprocVecEnv if n_envs == 2 else None
     # "module:id" imports the module in the worker processes too
     full_id = f"sb3_chdp:{env_id}" if env_id == ENV_ID else env_id
-    env = make_vec_env(full_id, n_envs, seed=0, env_kwargs={"render_mode": "rgb_array"}, vec_env_cls=vec_env_cls)
+    env: Any = make_vec_env(full_id, n_envs, seed=0, env_kwargs={"render_mode": "rgb_array"}, vec_env_cls=vec_env_cls)
     env = FrameVideoRecorder(env, str(tmp_path), lambda step: step == 0, video_length=1000)
     env.reset()
     expected = 1

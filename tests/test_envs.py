@@ -6,8 +6,8 @@ import inspect
 import pickle
 import subprocess
 import sys
+from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -15,6 +15,7 @@ from gymnasium.utils.env_checker import check_env
 from sb3_chdp import HybridActionSpec, check_hybrid_env
 from sb3_chdp.envs import ENV_IDS
 from sb3_chdp.envs.hard_move import HardMoveEnv
+from tests.hybrid_envs import gym_make
 
 EDGES = [
     ("Platform-v0", (0, [[np.nan]] * 3)),
@@ -67,17 +68,17 @@ def rollout(env, seed, n_steps=40):
 # Native bounds are the originals', and velocities have none there
 @pytest.mark.filterwarnings("ignore:.*(infinity|symmetric and normalized|render_mode)")
 def test_api(env_id):
-    check_env(gym.make(env_id).unwrapped, skip_render_check=True)
+    check_env(gym_make(env_id).unwrapped, skip_render_check=True)
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_check_hybrid_env(env_id):
-    check_hybrid_env(gym.make(env_id))
+    check_hybrid_env(gym_make(env_id))
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_seeding_and_pickling(env_id):
-    env = gym.make(env_id)
+    env = gym_make(env_id)
     first = rollout(env, seed=7)
     np.testing.assert_equal(rollout(env, seed=7), first)
     np.testing.assert_equal(rollout(pickle.loads(pickle.dumps(env)), seed=7), first)
@@ -92,7 +93,7 @@ def test_seeding_and_pickling(env_id):
 
 @pytest.mark.parametrize("env_id, action", EDGES)
 def test_bad_actions(env_id, action):
-    env = gym.make(env_id).unwrapped
+    env = gym_make(env_id).unwrapped
     env.reset(seed=0)
     state = env.get_state()
     with pytest.raises(ValueError, match="action must be"):
@@ -102,13 +103,13 @@ def test_bad_actions(env_id, action):
 
 @pytest.mark.parametrize("env_id, options, expected", STARTS)
 def test_reset_options(env_id, options, expected):
-    env = gym.make(env_id)
+    env = gym_make(env_id)
     obs, _ = env.reset(seed=4, options=options)
     state = env.get_state()
     assert {name: state[name] for name in expected} == expected
     np.testing.assert_array_equal(env.set_state(state), obs)
     # The option neither lasts nor changes what is random afterwards
-    other = gym.make(env_id)
+    other = gym_make(env_id)
     other.reset(seed=4)
     np.testing.assert_array_equal(env.reset()[0], other.reset()[0])
     assert env.get_state() == other.get_state()
@@ -117,13 +118,13 @@ def test_reset_options(env_id, options, expected):
 @pytest.mark.parametrize("env_id, options, named", OPTIONS)
 def test_bad_reset_options(env_id, options, named):
     with pytest.raises(ValueError, match=rf"options\['{named}'\]"):
-        gym.make(env_id).reset(options=options)
+        gym_make(env_id).reset(options=options)
 
 
 def test_reset_options_reach_vectorised_environments():
     from stable_baselines3.common.env_util import make_vec_env
 
-    env = make_vec_env("sb3_chdp/HardMove4-v0", 2)
+    env: Any = make_vec_env("sb3_chdp/HardMove4-v0", 2)
     env.set_options([{"start": (0.0, 0.0), "target": (0.5, y)} for y in (0.25, -0.25)])
     np.testing.assert_array_equal(env.reset()[:, 2:], [[0.5, 0.25], [0.5, -0.25]])
 
@@ -131,7 +132,7 @@ def test_reset_options_reach_vectorised_environments():
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_states_resume_an_episode(env_id):
     """After set_state the same actions lead to the same steps, noise, step limit and next episodes included."""
-    env = gym.make(f"sb3_chdp/{env_id}")
+    env = gym_make(f"sb3_chdp/{env_id}")
     env.action_space.seed(1)
 
     def go_on(env, actions):
@@ -152,7 +153,7 @@ def test_states_resume_an_episode(env_id):
     env.set_state(state)
     np.testing.assert_equal(go_on(env, actions), expected)
     # In another process the environment is a new one
-    fresh = gym.make(f"sb3_chdp/{env_id}")
+    fresh = gym_make(f"sb3_chdp/{env_id}")
     fresh.reset(seed=99)
     fresh.set_state(state)
     np.testing.assert_equal(go_on(fresh, actions), expected)
@@ -166,7 +167,7 @@ def test_states_of_vectorised_environments():
     """As SB3's env_method reaches them, through Monitor."""
     from stable_baselines3.common.env_util import make_vec_env
 
-    env = make_vec_env("sb3_chdp/HardMove4-v0", 2, seed=0)
+    env: Any = make_vec_env("sb3_chdp/HardMove4-v0", 2, seed=0)
     env.reset()
     actions = [(3, [np.ones(1)] * 16)] * 2
     for _ in range(28):
@@ -180,7 +181,7 @@ def test_states_of_vectorised_environments():
 
 
 def test_bad_states():
-    env = gym.make("Goal-v0")
+    env = gym_make("Goal-v0")
     env.reset(seed=0)
     state = env.get_state()
     with pytest.raises(ValueError, match="got ball_z"):
@@ -199,7 +200,7 @@ def test_arguments():
     obs, _ = env.reset(options={"target": (0.1, 0.2)})
     np.testing.assert_array_equal(obs, np.zeros(4))
     with pytest.raises(ValueError, match="target must be"):
-        HardMoveEnv(target=(0.1,))
+        HardMoveEnv(target=(0.1,))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="n_actuators must be"):
         HardMoveEnv(n_actuators=1)
     with pytest.raises(ValueError, match="render_mode must be"):
@@ -208,7 +209,7 @@ def test_arguments():
 
 def test_noise_is_random_and_can_be_silenced():
     for noise in (True, False):
-        env = gym.make("Goal-v0", noise=noise)
+        env = gym_make("Goal-v0", noise=noise)
         env.reset(seed=0)
         state = env.get_state()
         del state["np_random"]
@@ -257,7 +258,7 @@ def test_ids_alone():
 
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_pages_name_all_arguments_and_options(env_id):
-    env_class = type(gym.make(env_id).unwrapped)
+    env_class: Any = type(gym_make(env_id).unwrapped)
     page = env_class.__doc__.split("## Arguments")[1]
     for name, parameter in list(inspect.signature(env_class).parameters.items()):
         assert f"| `{name}` | {str(parameter.default).strip()} |" in page

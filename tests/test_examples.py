@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -45,12 +46,10 @@ def test_a_few_steps(name, tmp_path):
 
 
 def test_the_table_is_filled_row_by_row(tmp_path):
-    specification = importlib.util.spec_from_file_location("compare", FOLDER / "compare.py")
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
+    write_row = runpy.run_path(str(FOLDER / "compare.py"))["write_row"]
     page = tmp_path / "page.md"
     page.write_text("| a | 1 | 2 |\n| b | 3 | 4 |\n")
-    module.write_row(page, "a", "5 | 6")
+    write_row(page, "a", "5 | 6")
     assert page.read_text() == "| a | 5 | 6 |\n| b | 3 | 4 |\n"
     with pytest.raises(ValueError, match="begins with 'c'"):
-        module.write_row(page, "c", "7 | 8")
+        write_row(page, "c", "7 | 8")

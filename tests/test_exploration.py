@@ -1,6 +1,7 @@
 """When CHDP explores, and what its exploratory actions are."""
 
 import inspect
+from functools import partial
 
 import numpy as np
 import pytest
@@ -52,7 +53,7 @@ def test_it_follows_from_the_steps_whatever_the_length_of_the_training():
     rates = []
     for total in (60, 600):
         model = fast_model(env=make_layout_env(), gradient_steps=0)
-        seen = []
+        seen: list = []
 
         def note(local_values, _, model=model, seen=seen):
             seen.append(model.logger.name_to_value.get("rollout/exploration_rate"))
@@ -113,7 +114,7 @@ def test_it_explores_on_while_success_is_rare(n_envs, wrap):
     """Returns are those of the environment, normalised or not."""
     rates = {}
     for every in (2, 50):
-        env = wrap(DummyVecEnv([lambda every=every: Rewarded(every)] * n_envs))
+        env = wrap(DummyVecEnv([partial(Rewarded, every)] * n_envs))
         model = fast_model(env=env, learning_starts=10**9)
         model.learn(3000, log_interval=10**6)
         rates[every] = model.logger.name_to_value["rollout/exploration_rate"]

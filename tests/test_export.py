@@ -46,7 +46,7 @@ def export(model, path, observations, example):
     program = th.export.export(ExportablePolicy(model.policy), (example,), dynamic_shapes=shapes)
     with th.no_grad():
         exported = [part.numpy() for part in program.module()(observations)]
-    th.onnx.export(program, None, str(path), verbose=False)
+    th.onnx.export(program, f=str(path), verbose=False)
     session = ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     parts = list(observations.values()) if isinstance(observations, dict) else [observations]
     feed = {place.name: part.numpy() for place, part in zip(session.get_inputs(), parts, strict=True)}
@@ -96,7 +96,7 @@ def test_a_trained_model(tmp_path):
     model.observation_space.seed(0)
     observations = th.as_tensor(batch_of(model.observation_space, N))
     _, (k, parameters) = export(model, tmp_path / "policy.onnx", observations, observations[:2])
-    values = [[], []]
+    values: tuple[list, list] = ([], [])
     for network, kept in zip(model.critic_target.q_networks, values, strict=True):
         network.register_forward_hook(lambda module, args, outputs, kept=kept: kept.append(outputs.detach()[:, 0]))
     with th.no_grad():
@@ -148,7 +148,7 @@ def test_parameters_are_in_the_units_of_the_space(layout):
 
 def test_other_policies_are_refused():
     with pytest.raises(TypeError, match=r"policy must be model\.policy of a model of sb3_chdp, got ActorCriticPolicy"):
-        ExportablePolicy(PPO("MlpPolicy", gym.make("CartPole-v1")).policy)
+        ExportablePolicy(PPO("MlpPolicy", gym.make("CartPole-v1")).policy)  # type: ignore[arg-type]
 
 
 def test_the_page(tmp_path, monkeypatch):

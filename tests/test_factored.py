@@ -20,7 +20,7 @@ from sb3_chdp.common.masks import read_masks
 from sb3_chdp.envs.hard_move import motion_table, unit_motions
 from sb3_chdp.hyar_td3.representation import ActionBatch, FactoredActionRepresentation
 from tests.algorithms import has_learnt, make_model, snapshot
-from tests.hybrid_envs import LayoutEnv, box
+from tests.hybrid_envs import LayoutEnv, box, gym_make
 
 CLASSES = [CHDP, PaperCHDP, HPPO, PATD3, HHQNTD3, HyARTD3]
 # 2^76 * 5 * 3 * 4 joint actions
@@ -228,7 +228,7 @@ def test_factored_hard_move_has_the_same_dynamics(n):
 @pytest.mark.parametrize("n", [10, 12, 16, 20])
 @pytest.mark.filterwarnings("ignore:.*(infinity|symmetric and normalized|render_mode)")
 def test_factored_hard_move_is_registered(n):
-    env = gym.make(f"sb3_chdp/FactoredHardMove{n}-v0")
+    env = gym_make(f"sb3_chdp/FactoredHardMove{n}-v0")
     assert env.action_space[0] == spaces.MultiBinary(n)
     check_hybrid_env(env)
     check_env(env.unwrapped, skip_render_check=True)

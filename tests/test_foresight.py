@@ -147,7 +147,7 @@ def test_ends_of_episodes(monkeypatch):
     monkeypatch.setattr(exploring, "next_values", lambda policy, observation, masks: th.full((3, 1), 7.0))
     model.policy.value_scale.variance += 4 - model.policy.value_scale.variance
     model.policy.value_scale.center[0] = 2.0
-    claims = Claims(None, np.arange(3), np.zeros(3), np.array([1.0, 10.0, 100.0]), np.array([0.5, 0.5, 0.5]))
+    claims = Claims(np.empty((3, 0)), np.arange(3), np.zeros(3), np.array([1.0, 10.0, 100.0]), np.array([0.5, 0.5, 0.5]))
     infos = [{}, {}, {"TimeLimit.truncated": True}]
     rewards = np.array([3.0, 4.0, 5.0], dtype=np.float32)
     model._check_claims(claims, model._last_obs, rewards, np.array([False, True, True]), infos)

@@ -1,6 +1,7 @@
 """Numbers that nothing can be learnt from are refused before they are stored or fed, and losses before they move a network."""
 
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -160,7 +161,7 @@ def test_normalization_forgets_what_is_refused(place, value, observation_space):
 def test_normalization_forgets_a_refused_first_observation(algorithm):
     broken = BrokenEnv("first", np.nan)
     broken.n_resets = 1
-    env = VecNormalize(DummyVecEnv([lambda: broken]))
+    env: Any = VecNormalize(DummyVecEnv([lambda: broken]))
     model = make_model(algorithm, env)
     with pytest.raises(ValueError, match="The observation must be finite"):
         model.learn(60)

@@ -90,7 +90,7 @@ def test_the_card(pushed, monkeypatch):
     # The example loads the model
     monkeypatch.setattr(huggingface_hub, "hf_hub_download", lambda repo, file: str(pushed / "the_hub" / repo / file))
     names: dict = {}
-    exec(re.search(r"```python\n(from.*?)```", card.text, re.DOTALL)[1], names)
+    exec(re.findall(r"```python\n(from.*?)```", card.text, re.DOTALL)[0], names)
     assert isinstance(names["model"], sb3_chdp.PATD3)
 
 

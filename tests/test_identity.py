@@ -1,5 +1,7 @@
 """Learning tests with budgets that a broken algorithm cannot meet."""
 
+from typing import Any
+
 import pytest
 import torch as th
 from stable_baselines3.common.env_util import make_vec_env
@@ -13,7 +15,7 @@ from tests.hybrid_envs import HybridIdentityEnv
 # chooses 0 for its parameter in 30 %, one that gets the parameter right and guesses the action in 33 %
 THRESHOLD = 0.8
 BASELINES = [algorithm for algorithm in OFF_POLICY_ALGORITHMS if algorithm is not CHDP]
-SETTINGS = {
+SETTINGS: dict[type, dict[str, Any]] = {
     **{
         baseline: dict(gradient_steps=8, learning_rate=1e-3, learning_starts=200, policy_kwargs=dict(net_arch=[64, 64]))
         for baseline in OFF_POLICY_ALGORITHMS

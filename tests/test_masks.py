@@ -10,6 +10,7 @@ from stable_baselines3.common import callbacks
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy as evaluate_free_policy
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chdp import ALGORITHMS as REGISTRY
 from sb3_chdp import HHQNTD3, HPPO, PATD3, PDQNTD3, HyARTD3, HybridActionSpec
@@ -81,8 +82,7 @@ def test_an_environment_that_allows_nothing(algorithm):
             self.masks = self.masks & (self.t < 5)
             return obs
 
-    env = make_vec_env(MaskedEnv, 2)
-    env.envs[1] = StuckEnv()
+    env = DummyVecEnv([MaskedEnv, StuckEnv])
     with pytest.raises(ValueError, match=r"got none from environment\(s\) \[1\]"):
         make_model(algorithm, env).learn(60)
 

@@ -172,7 +172,8 @@ def test_in_a_policy(policy, tmp_path):
     observations, _ = model.policy.obs_to_tensor(env.observation())
     for extractor in extractors(model):
         extractor.train(False)
-    np.testing.assert_allclose(*(extractor(observations).numpy() for extractor in extractors(model)), atol=0.2)
+    first, second = (extractor(observations).numpy() for extractor in extractors(model))
+    np.testing.assert_allclose(first, second, atol=0.2)
 
     before = {name: value.clone() for name, value in target.items()}
     obs = [env.observation() for _ in range(4)]

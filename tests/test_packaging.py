@@ -60,7 +60,7 @@ def test_classes_of_the_registry_are_exported():
 
 
 def test_example_of_the_readme(capsys):
-    code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1]
+    code = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[0]
     names: dict = {}
     exec(code.replace("2_000", "150"), names)
     assert names["Drone"].action_space.contains(names["action"])

@@ -26,7 +26,7 @@ def bounds(draw, dtype):
     if np.issubdtype(dtype, np.integer):
         limits = np.iinfo(dtype)
         # Floats, in which rows are kept, hold no larger integers exactly
-        numbers = st.integers(max(int(limits.min), -(2**50)), min(int(limits.max), 2**50))
+        numbers: st.SearchStrategy[float] = st.integers(max(int(limits.min), -(2**50)), min(int(limits.max), 2**50))
     else:
         largest = float(np.finfo(dtype).max) / 4
         width = np.dtype(dtype).itemsize * 8

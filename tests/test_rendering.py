@@ -2,19 +2,19 @@
 
 import copy
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
 from sb3_chdp import HybridActionSpec
 from sb3_chdp.envs import ENV_IDS
+from tests.hybrid_envs import gym_make
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_rendering(env_id, monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pytest.importorskip("pygame")
-    env = gym.make(env_id, render_mode="rgb_array")
+    env = gym_make(env_id, render_mode="rgb_array")
     env.reset(seed=0)
     before = env.render()
     assert before.dtype == np.uint8 and before.shape == (*env.unwrapped.screen_size[::-1], 3)
@@ -37,7 +37,7 @@ def test_windows(env_id, monkeypatch):
     """pygame has one for all environments; whoever is closed first takes it away."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pytest.importorskip("pygame")
-    window, other = (gym.make(env_id, render_mode="human") for _ in range(2))
+    window, other = (gym_make(env_id, render_mode="human") for _ in range(2))
     window.reset(seed=0)
     other.reset(seed=0)
     other.close()
@@ -48,7 +48,7 @@ def test_windows(env_id, monkeypatch):
 def test_last_picture_says_how_the_episode_ended():
     pictures = {}
     for target in ((0.0, 0.1), (0.0, 1.0)):
-        env = gym.make("HardMove4-v0", render_mode="rgb_array")
+        env = gym_make("HardMove4-v0", render_mode="rgb_array")
         env.reset(options={"start": (0.0, 0.0), "target": target})
         *_, info = env.step((0, [np.zeros(1)] * 16))
         pictures[info.get("outcome")] = env.render()
@@ -63,7 +63,7 @@ def test_last_picture_says_how_the_episode_ended():
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_frame_callback(env_id):
     """It sees every frame inside a step, and changes nothing."""
-    watched, other = gym.make(env_id).unwrapped, gym.make(env_id).unwrapped
+    watched, other = gym_make(env_id).unwrapped, gym_make(env_id).unwrapped
     spec = HybridActionSpec(watched.action_space)
     states = []
     for env in (watched, other):
@@ -82,11 +82,11 @@ def test_frame_callback(env_id):
 @pytest.mark.parametrize("env_id", ["Platform-v0", "Goal-v0", "HardMove4-v0"])
 def test_pictures_of_every_frame(env_id):
     pytest.importorskip("pygame")
-    env = gym.make(env_id, render_mode="rgb_array")
+    env = gym_make(env_id, render_mode="rgb_array")
     env.reset(seed=0)
     env.action_space.seed(0)
     with pytest.raises(ValueError, match="render_mode must be"):
-        gym.make(env_id).unwrapped.render_frames()
+        gym_make(env_id).unwrapped.render_frames()
     (first,) = env.unwrapped.render_frames()
     np.testing.assert_array_equal(first, env.render())
     *_, info = env.step(env.action_space.sample())

@@ -119,7 +119,7 @@ def test_onnx(tmp_path):
     observations = floats(RNG.normal(0, 10, (500, 17)))
     size = {0: th.export.Dim("n")}
     program = th.export.export(Noise(), (observations[:2],), dynamic_shapes=(size,))
-    th.onnx.export(program, None, str(tmp_path / "noise.onnx"), verbose=False)
+    th.onnx.export(program, f=str(tmp_path / "noise.onnx"), verbose=False)
     session = ort.InferenceSession(str(tmp_path / "noise.onnx"), providers=["CPUExecutionProvider"])
     results = session.run(None, {session.get_inputs()[0].name: observations.numpy()})
     for exported, expected in zip(results, Noise()(observations), strict=True):

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import threading
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -102,7 +103,7 @@ def test_without_state_a_fresh_episode_begins(vec_env_class, normalize, tmp_path
     assert len([w for w in said if "fresh episode" in str(w.message)]) == 1
     again = make_env(2, **kwargs)
     with pytest.warns(UserWarning, match="fresh episode") as said:
-        resumed = resume(tmp_path, again)
+        resumed: Any = resume(tmp_path, again)
     assert len([w for w in said if "fresh episode" in str(w.message)]) == 1
     if normalize:
         np.testing.assert_array_equal(again.ret_rms.var, env.ret_rms.var)
@@ -181,11 +182,11 @@ def test_dict_observations(tmp_path):
     settings = dict(replay_buffer_class=PrioritizedDictReplayBuffer, buffer_size=50, learning_starts=10, seed=0)
     model = CHDP("MultiInputPolicy", env, **settings)
     model.learn(80, ResumableCheckpoint(10, tmp_path))
-    buffer = resume(tmp_path, make_env(2, env_class=DictWalkEnv)).replay_buffer
+    resumed: Any = resume(tmp_path, make_env(2, env_class=DictWalkEnv))
     for name in ("observations", "next_observations"):
         for key, rows in getattr(model.replay_buffer, name).items():
-            np.testing.assert_array_equal(getattr(buffer, name)[key], rows)
-    np.testing.assert_array_equal(buffer.priorities, model.replay_buffer.priorities)
+            np.testing.assert_array_equal(getattr(resumed.replay_buffer, name)[key], rows)
+    np.testing.assert_array_equal(resumed.replay_buffer.priorities, model.replay_buffer.priorities)
 
 
 def test_wrappers_with_a_state_of_their_own(tmp_path):

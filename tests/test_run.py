@@ -1,6 +1,7 @@
 """Everything that an SB3 user does with a model, on every layout of hybrid actions."""
 
 from copy import deepcopy
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -216,7 +217,7 @@ def test_flattened_for_stock_algorithms(layout):
     env = FlattenHybridAction(make_layout_env(layout))
     check_hybrid_env(env.env)
     for stock in (TD3, PPO):
-        kwargs = dict(learning_starts=10) if stock is TD3 else dict(n_steps=16, batch_size=16)
+        kwargs: dict[str, Any] = dict(learning_starts=10) if stock is TD3 else dict(n_steps=16, batch_size=16)
         stock("MlpPolicy", env, policy_kwargs=dict(net_arch=[8]), **kwargs).learn(24)
 
 

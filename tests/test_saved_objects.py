@@ -33,7 +33,7 @@ SPACES = [
     spaces.Box(-1, 1, (0,)),
     spaces.Box(-1, 1, ()),
     spaces.Discrete(4, start=-2),
-    spaces.MultiDiscrete([[2, 3], [4, 5]], start=[[0, 1], [2, 3]]),
+    spaces.MultiDiscrete(np.array([[2, 3], [4, 5]]), start=np.array([[0, 1], [2, 3]])),
     spaces.MultiBinary(3),
     spaces.MultiBinary([2, 3]),
     spaces.Dict(ORDERED),
@@ -83,7 +83,7 @@ def test_action_noise(noise, n_envs, tmp_path):
     for each in (model, loaded):
         np.random.seed(0)
         values.append([each.action_noise() for _ in range(3)])
-    np.testing.assert_array_equal(*values)
+    np.testing.assert_array_equal(values[0], values[1])
     loaded.learn(20)
 
 

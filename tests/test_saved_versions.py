@@ -74,6 +74,7 @@ def test_zip_of_sb3s_kind(algorithm, tmp_path):
 def test_sb3_reads_the_zip(algorithm, tmp_path):
     model = saved_model(algorithm, tmp_path)
     data, params, _ = load_from_zip_file(tmp_path / "model")
+    assert data is not None
     assert data["num_timesteps"] == model.num_timesteps and data["policy_kwargs"] == dict(net_arch=[8, 8])
     other = make_model(algorithm, make_layout_env(), seed=3)
     other.set_parameters(params)

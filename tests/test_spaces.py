@@ -1,5 +1,6 @@
 import copy
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,7 +49,7 @@ def hybrid_spaces(draw):
         return spaces.Dict({"which": discrete, **{f"p{i}": option for i, option in enumerate(options)}})
     if layout == "one_of":
         return spaces.OneOf(options)
-    others = [spaces.MultiDiscrete([2, 3]), spaces.MultiBinary((2, 1)), spaces.MultiDiscrete([[2], [1]])]
+    others = [spaces.MultiDiscrete([2, 3]), spaces.MultiBinary((2, 1)), spaces.MultiDiscrete(np.array([[2], [1]]))]
     return spaces.Tuple((discrete, draw(st.sampled_from(others)), spaces.Dict({"x": options[0], "y": box(-1, 1, 2)})))
 
 
@@ -59,10 +60,11 @@ def executed_boxes(space, is_shared, k):
     elif is_shared:
         leaves = leaves_of(space)
     else:
-        rest = [(key, child) for key, child in children_of(space) if not isinstance(child, spaces.Discrete)]
-        options = [((key,), child) for key, child in rest]
-        if len(rest) == 1 and children_of(rest[0][1]) is not None:
-            options = [((rest[0][0], key), child) for key, child in children_of(rest[0][1])]
+        rest = [(key, child) for key, child in children_of(space) or [] if not isinstance(child, spaces.Discrete)]
+        options: list[tuple[tuple, Any]] = [((key,), child) for key, child in rest]
+        nested = children_of(rest[0][1]) if len(rest) == 1 else None
+        if nested is not None:
+            options = [((rest[0][0], key), child) for key, child in nested]
         path, option = options[k]
         leaves = leaves_of(option, path)
     return [(path, leaf) for path, leaf in leaves if isinstance(leaf, spaces.Box)]

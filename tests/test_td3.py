@@ -1,5 +1,7 @@
 """The baselines that are TD3 on scores and parameters."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch as th
@@ -9,7 +11,7 @@ from sb3_chdp import HHQNTD3, PATD3, FlattenHybridAction
 from sb3_chdp.common.td3 import InvertingGradients
 from tests.hybrid_envs import make_layout_env
 
-SMALL = dict(
+SMALL: dict[str, Any] = dict(
     batch_size=16, learning_starts=10**9, buffer_size=500, seed=0, learning_rate=1e-3,
     policy_kwargs=dict(net_arch=[16], optimizer_kwargs=dict(fused=True)),
 )  # fmt: skip
@@ -39,6 +41,7 @@ def test_inverting_gradients_against_a_slow_loop():
     values = (th.rand(20, 3) * 2.4 - 1.2).requires_grad_()
     weights = th.randn(20, 3)
     (InvertingGradients()(values) * weights).sum().backward()
+    assert values.grad is not None
     for i in range(20):
         for j in range(3):
             ascent = -weights[i, j]  # of what the loss is the negative of
@@ -55,7 +58,8 @@ def test_inverting_gradients_is_an_option(algorithm, tmp_path):
         obs = th.rand(8, 2)
         loss = -model.critic.q1_forward(obs, model.actor(obs)).mean()
         gradients.append(th.autograd.grad(loss, list(model.actor.mu.parameters()))[0])
-    assert not th.allclose(*gradients)
+    plain, inverted = gradients
+    assert not th.allclose(plain, inverted)
     model.learn(20)
     model.save(tmp_path / "model")
     assert algorithm.load(tmp_path / "model").policy.inverting_gradients

@@ -24,7 +24,7 @@ def test_target_update_moves_shared_parameters_once_and_copies_statistics():
     before = deepcopy(networks)
     with th.no_grad():
         for p in nn.ModuleList(networks).parameters():
-            p += 1
+            p.add_(1)
     networks[0](th.randn(8, 2))
     TargetUpdate(networks, targets)(0.25)
     for network, target, old in zip(networks, targets, before, strict=True):

@@ -46,9 +46,8 @@ def plot(codewords: np.ndarray, motions: np.ndarray) -> None:
     lengths = np.linalg.norm(motions, axis=1)
     moves = lengths > 1e-6
     angles = np.degrees(np.arctan2(motions[:, 1], motions[:, 0])) % 360
-    picture = axis.scatter(
-        *points[moves].T, c=angles[moves], s=160 * lengths[moves], cmap="hsv", vmin=0, vmax=360, edgecolors="black"
-    )
+    x, y = points[moves].T
+    picture = axis.scatter(x, y, c=angles[moves], s=160 * lengths[moves], cmap="hsv", vmin=0, vmax=360, edgecolors="black")
     axis.scatter(*points[~moves].T, marker="x", color="black", label="no motion")
     figure.colorbar(picture, label="direction of the motion, degrees (size: length)")
     axis.set(xlabel=f"first axis ({shares[0]:.0f} % of the variance)", ylabel=f"second axis ({shares[1]:.0f} %)")

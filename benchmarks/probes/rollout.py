@@ -32,7 +32,7 @@ def published(env_id: str, algorithm: type[BaseAlgorithm] = CHDP) -> Path:
     return BENCHMARKS / "models" / folders[algorithm.__name__] / f"{env_id}_1" / f"{env_id}.zip"
 
 
-def load_model(env_id: str, algorithm: type[BaseAlgorithm] = CHDP, path: str | None = None) -> BaseAlgorithm:
+def load_model(env_id: str, algorithm: type[BaseAlgorithm] = CHDP, path: str | None = None) -> Any:
     """
     :param env_id: environment, without the namespace
     :param algorithm: class of the model
@@ -64,7 +64,7 @@ def play(
     :return: the episode
     """
     obs, _ = env.reset(seed=seed, options=options)
-    observations, actions, over, info = [], [], False, {}
+    observations, actions, over = [], [], False
     while not over:
         action, _ = model.predict(obs, deterministic=deterministic)
         observations.append(obs)

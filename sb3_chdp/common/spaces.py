@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_chdp.common.arguments import check, one_of
@@ -170,14 +171,14 @@ class HybridActionSpec:
         """
         return choices if choices.ndim == 1 else choices[:, 0] * 0
 
-    def to_native(self, row: np.ndarray) -> Any:
+    def to_native(self, row: npt.ArrayLike) -> Any:
         """
         :param row: (1 + Pmax,) ``[k | scaled parameters]``; parameters are clipped to [-1, 1], padding is ignored
         :return: the native action; ``space.contains`` holds for it
         """
         return self.to_native_batch(np.asarray(row)[None])[0]
 
-    def to_native_batch(self, rows: np.ndarray) -> list[Any]:
+    def to_native_batch(self, rows: npt.ArrayLike) -> list[Any]:
         """
         :param rows: (n, 1 + Pmax) or wider, ``[k | scaled parameters | ignored]``
         :return: n native actions

@@ -81,7 +81,7 @@ def clip(gradients: list[th.Tensor], norm: float, max_norm: float) -> None:
 
 
 def gradient_step(
-    loss: th.Tensor, optimizers: list[th.optim.Optimizer], max_grad_norm: float | None = None, name: str = "The loss"
+    loss: th.Tensor, optimizers: Sequence[th.optim.Optimizer], max_grad_norm: float | None = None, name: str = "The loss"
 ) -> None:
     """
     One gradient step of the parameters of the given optimizers, and of no others.
