@@ -7,12 +7,12 @@ import gymnasium as gym
 import numpy as np
 import rl_zoo3.exp_manager
 import rl_zoo3.utils
-import yaml
 from rl_zoo3.exp_manager import ExperimentManager
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3.common import callbacks
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_chdp
@@ -98,6 +98,11 @@ class HybridExperimentManager(ExperimentManager):
         self.monitor_kwargs = {**self.monitor_kwargs, "info_keywords": tuple(key for key in wanted if key in present)}
         return super().create_envs(n_envs, eval_env, no_log)
 
+    def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
+        if self.normalize:
+            self.normalize_kwargs = {**_normalizable(env.observation_space), **self.normalize_kwargs}
+        return super()._maybe_normalize(env, eval_env)
+
     @cached_property
     def _example(self) -> tuple[gym.Space[Any], dict[str, Any]]:
         """:return: action space of the environment, and what the infos of an episode hold"""
@@ -122,12 +127,22 @@ def random_action(env: gym.Env, rng: np.random.Generator) -> Any:
     return spec.to_native(spec.sample_rows(rng, 1, allowed_now(env, spec))[0])
 
 
+def _normalizable(space: gym.Space[Any]) -> dict[str, Any]:
+    """:return: arguments of VecNormalize with which it takes the observations: it normalises vectors and no images"""
+
+    def is_vector(part: gym.Space[Any]) -> bool:
+        return isinstance(part, gym.spaces.Box) and not is_image_space(part)
+
+    if isinstance(space, gym.spaces.Dict):
+        keys = [key for key, part in space.items() if is_vector(part)]
+        return {"norm_obs_keys": keys} if keys else {"norm_obs": False}
+    return {} if is_vector(space) else {"norm_obs": False}
+
+
 def _flatten(settings: dict[str, Any]) -> None:
-    """Wrap the environment, and normalise as the first algorithm of this package does unless told otherwise."""
+    """Wrap the environment, and normalise as the algorithms of this package do unless told otherwise."""
     wrappers = settings.get("env_wrapper") or []
     wrappers = [wrappers] if isinstance(wrappers, (str, dict)) else list(wrappers)
     if not any(FLATTEN in str(wrapper) for wrapper in wrappers):
         settings["env_wrapper"] = [*wrappers, FLATTEN]
-    defaults = yaml.safe_load(next(iter(ALGORITHMS.values())).hyperparams.read_text())["default"]
-    if "normalize" in defaults:
-        settings.setdefault("normalize", defaults["normalize"])
+    settings.setdefault("normalize", True)

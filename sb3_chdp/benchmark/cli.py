@@ -197,7 +197,8 @@ def write_report(
     for x, name in (("timesteps", "curves_steps.png"), ("minutes", "curves_minutes.png")):
         figures.plot_curves(results, scores, rows, envs, x, out / name)
     figures.plot_scores(scores, rows, envs, out / "scores.png", paper.paper_mean if with_paper else None)
-    pictures = "\n\n".join(f"![]({name}.png)" for name in ("curves_steps", "curves_minutes", "scores"))
+    alternatives = {"curves_steps": "Curves over steps", "curves_minutes": "Curves over minutes", "scores": "Scores"}
+    pictures = "\n\n".join(f"![{alternative}]({name}.png)" for name, alternative in alternatives.items())
     (out / "report.md").write_text(f"{text}\n\n{pictures}\n")
     return text
 

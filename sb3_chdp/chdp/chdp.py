@@ -44,7 +44,7 @@ class CHDP(ExploringAlgorithm):
     Paper: Liu et al., "CHDP: Cooperative Hybrid Diffusion Policies for Reinforcement Learning in Parameterized Action
     Space", AAAI 2026. No reference code is published.
 
-    The defaults need no tuning: observations, rewards and parameters may have any units.
+    Observations, rewards and parameters may have any units.
 
     :class:`PaperCHDP` is the algorithm as published. Differences from it:
         1. observations are normalised, see :class:`NormalizedExtractor`, and values, see :class:`ValueScale`;

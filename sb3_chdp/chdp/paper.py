@@ -72,7 +72,7 @@ class PaperMultiInputPolicy(CombinedFeatures, PaperPolicy):
 
 class PaperCHDP(CHDP):
     """
-    Cooperative Hybrid Diffusion Policies (CHDP) as in the paper, for those who compare with it; :class:`CHDP` learns faster.
+    Cooperative Hybrid Diffusion Policies (CHDP) as in the paper, for those who compare with it.
 
     One draw of the policies acts, random actions are for the warm-up alone, and the target takes one draw as well. The
     discrete policy is improved with the stored parameters, the continuous policy for the latents of the discrete one, and

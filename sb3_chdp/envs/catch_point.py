@@ -14,7 +14,7 @@ MISSES_ALLOWED = 11
 
 class CatchPointEnv(PointMassEnv):
     """
-    Steer a point mass to a target and catch it there. Catches that miss are counted: a dozen ends the episode.
+    Steer a point mass to a target and catch it there. The step after the eleventh catch that misses ends the episode.
 
     The mass is 1, the damping 0.25, a step is a frame of 0.1 seconds. Transitions have no noise.
 
@@ -46,7 +46,8 @@ class CatchPointEnv(PointMassEnv):
 
     ## Episode end
 
-    Termination: a catch (`info["outcome"]` is "catch", success), or any step after 11 misses ("misses"). Truncation: 25 steps.
+    Termination: a catch (`info["outcome"]` is "catch", success), or the step after the eleventh miss ("misses").
+    Truncation: 25 steps.
 
     ## Arguments
 
