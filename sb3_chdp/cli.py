@@ -58,6 +58,8 @@ COMMANDS = (*SCRIPTS, "benchmark")
 IMPORTERS = ("train", "optimize", "enjoy")
 # Scripts that play a model
 PLAYERS = ("enjoy", "record", "push_to_hub")
+# Environment variables of which Linux has one where a window can be shown
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
 # What rl_zoo3 2.9.2 imports, declared by it or not
 REQUIRED = ("rl_zoo3", "requests", "pandas", "tensorboard")
 BENCHMARK_REQUIRED = (*REQUIRED, "rliable", "submitit", "filelock")
@@ -119,13 +121,15 @@ def run_script(command: str, arguments: list[str]) -> None:
     else:
         arguments = prepare_arguments(command, arguments)
     if command in ("plot", "all_plots"):
-        from sb3_chdp.zoo_plots import show_as, take_output
+        from sb3_chdp.zoo_plots import show_as, take_output, tell_runs_apart
 
         arguments, picture = take_output(command, arguments)
         if not ({"--no-display"} | HELP) & set(arguments):
             show_as(picture)
     elif command != "plot_from_file" and not HELP & set(arguments):
         check_env(option(arguments, "--env"))
+    if command == "enjoy" and "--no-render" not in arguments and not has_display():
+        raise ArgumentsError("there is no display to show it on; --no-render gives numbers, sb3-chdp record a video")
     if command == "record":
         from stable_baselines3.common import vec_env
 
@@ -134,16 +138,23 @@ def run_script(command: str, arguments: list[str]) -> None:
         vars(vec_env).update(VecVideoRecorder=FrameVideoRecorder)
     sys.argv = [f"sb3-chdp {command}", *arguments]
     module, function = SCRIPTS[command]
+    if command in ("plot", "all_plots"):
+        tell_runs_apart(importlib.import_module(module))
     if function is None:
         runpy.run_module(module, run_name="__main__", alter_sys=True)
     else:
         getattr(importlib.import_module(module), function)()
 
 
+def has_display() -> bool:
+    """:return: whether a window can be shown; SDL's dummy counts as one"""
+    return sys.platform != "linux" or any(os.environ.get(name) for name in DISPLAYS)
+
+
 def main() -> None:
     """Entry point of ``sb3-chdp`` and ``python -m sb3_chdp``."""
     if len(sys.argv) < 2 or sys.argv[1] in HELP:
-        print(__doc__)
+        print(__doc__.replace("``", "").strip())
         return
     if sys.argv[1] == "--version":
         print(f"sb3_chdp {__version__}")

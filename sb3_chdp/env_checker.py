@@ -8,7 +8,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch as th
 from gymnasium import spaces
 from gymnasium.utils.env_checker import data_equivalence
 from stable_baselines3.common.env_checker import check_env
@@ -56,18 +55,8 @@ def check_hybrid_env(env: gym.Env, action_layout: str = "auto", warn: bool = Tru
         for sentence in [_unusual_space(spec), *player.oddities(), player.seed_oddity()]:
             if sentence is not None:
                 warnings.warn(sentence, stacklevel=2)
-    flat = _AllowedFlatActions(env, action_layout)
+    flat = FlattenHybridAction(env, action_layout)
     _call("SB3's check_env", check_env, flat, warn=warn, skip_render_check=skip_render_check)
-
-
-class _AllowedFlatActions(FlattenHybridAction):
-    """For SB3's ``check_env``, which knows no masks: of the scores those of allowed actions decide."""
-
-    def action(self, action: np.ndarray) -> Any:
-        masks = allowed_now(self.env, self.score_space.spec)
-        if masks is not None:
-            action = self.score_space.mask_scores(th.as_tensor(action)[None], th.as_tensor(masks)).numpy()[0]
-        return super().action(action)
 
 
 def _check_is_env(env: Any) -> None:

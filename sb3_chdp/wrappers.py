@@ -4,9 +4,11 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch as th
 from gymnasium import spaces
 
 from sb3_chdp.common.hybrid_box import ScoreBox
+from sb3_chdp.common.masks import allowed_now
 
 
 class FlattenHybridAction(gym.ActionWrapper[np.ndarray, np.ndarray, Any]):
@@ -14,7 +16,8 @@ class FlattenHybridAction(gym.ActionWrapper[np.ndarray, np.ndarray, Any]):
     Let SB3's own algorithms (SAC, TD3, PPO, ...) run on an environment with hybrid actions.
 
     The action is a vector in [-1, 1]^(K + P): a score for every discrete action, of which the highest is taken, followed by
-    the scaled parameters of all actions one after the other (PADDPG, Hausknecht and Stone, 2016).
+    the scaled parameters of all actions one after the other (PADDPG, Hausknecht and Stone, 2016). If the environment has
+    ``action_masks()``, the highest score of an allowed action counts.
 
     :param env: environment with a hybrid action space
     :param action_layout: see :class:`HybridActionSpec`
@@ -30,7 +33,15 @@ class FlattenHybridAction(gym.ActionWrapper[np.ndarray, np.ndarray, Any]):
         :param action: (K + P,) scores and parameters
         :return: the native action
         """
-        return self.score_space.to_native(np.asarray(action)[None])[0]
+        row = np.asarray(action)[None]
+        masks = allowed_now(self.env, self.score_space.spec)
+        if masks is not None:
+            row = self.score_space.mask_scores(th.as_tensor(row), th.as_tensor(masks)).numpy()
+        return self.score_space.to_native(row)[0]
+
+    def compute_reward(self, *args: Any) -> Any:
+        """:return: that of the environment, see :class:`stable_baselines3.her.HerReplayBuffer`"""
+        return self.env.get_wrapper_attr("compute_reward")(*args)
 
 
 class ScalarBoxes(gym.ActionWrapper[Any, Any, Any]):

@@ -21,6 +21,7 @@ from sb3_chdp.common.evaluation import evaluate_policy
 from sb3_chdp.common.masks import allowed_now
 from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.registry import ALGORITHMS
+from sb3_chdp.zoo_arguments import ArgumentsError
 
 # Of a random episode, at whose end some environments say whether it was a success
 EXAMPLE_STEPS = 1000
@@ -74,6 +75,12 @@ class HybridExperimentManager(ExperimentManager):
 
     def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
         hyperparams, saved = super().read_hyperparameters()
+        if self.storage and self.study_name and self.trial_id == 0:
+            # rl_zoo3 takes trial 0 for none
+            of_trial = {**self.load_trial(self.storage, self.study_name, 0), **(self.custom_hyperparams or {})}
+            hyperparams.update(of_trial)
+            saved.update(of_trial)
+            print(f"Settings of trial 0: {of_trial}")
         if hyperparams.get("env_kwargs") and not self.env_kwargs:
             # Those of the YAML file are for evaluation too
             self.env_kwargs = hyperparams["env_kwargs"]
@@ -82,6 +89,12 @@ class HybridExperimentManager(ExperimentManager):
             for settings in (hyperparams, saved):
                 _flatten(settings)
         return hyperparams, saved
+
+    def load_trial(self, storage: str, study_name: str, trial_id: int | None = None, convert: bool = True) -> dict[str, Any]:
+        try:
+            return super().load_trial(storage, study_name, trial_id, convert)
+        except IndexError:
+            raise ArgumentsError(f"--trial-id {trial_id}: the study {study_name} has no such trial; the first is 0") from None
 
     @staticmethod
     def _preprocess_schedules(hyperparams: dict[str, Any]) -> dict[str, Any]:

@@ -69,7 +69,7 @@ def split_option(arguments: list[str], name: str) -> tuple[list[str], list[str]]
 
 def unknown(kind: str, name: str, known: Iterable[str], hint: str) -> str:
     """:return: message about a name that nobody knows, with the nearest one that somebody does"""
-    close = difflib.get_close_matches(name, list(known), n=1)
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.8)
     return f"unknown {kind} {name!r}{f', did you mean {close[0]}?' if close else ''} ({hint})"
 
 
@@ -110,7 +110,7 @@ def check_env(env_id: str | None) -> None:
 
 def complete(command: str, arguments: list[str]) -> list[str]:
     """
-    Name the run that was trained last, of those in the folder ``logs`` that fit, where the user names no folder.
+    Name the run that was trained last, of those that fit, in the folder ``logs`` if the user names no other one.
 
     :param command: a key of ``READERS``
     :param arguments: what the user wrote
@@ -118,13 +118,13 @@ def complete(command: str, arguments: list[str]) -> list[str]:
     :raises ArgumentsError: if there is no such run
     """
     names = READERS[command]
-    if option(arguments, *names.folder) is not None or HELP & set(arguments):
-        return arguments
-    algo, env = option(arguments, *names.algo), option(arguments, *names.env)
-    # Not the folders that a tuning leaves behind; those with checkpoints alone if the user asks for one
+    folder, algo, env = (option(arguments, *of) for of in (names.folder, names.algo, names.env))
     is_plot = not names.exp_id
+    if HELP & set(arguments) or (folder is not None and (is_plot or env is not None)):
+        return arguments
+    # Not the folders that a tuning leaves behind; those with checkpoints alone if the user asks for one
     any_file = is_plot or any(argument.startswith("--load-") for argument in arguments)
-    files = Path(LOGS).glob(
+    files = Path(folder or LOGS).glob(
         f"{(algo or '*').removeprefix(STOCK)}/{folder_name(env or '*')}_*/{'*.monitor.csv' if is_plot else '*.zip'}"
     )
     newest: tuple[float, Path] | None = None
@@ -134,10 +134,10 @@ def complete(command: str, arguments: list[str]) -> list[str]:
             newest = max(newest or (0.0, file.parent), (file.stat().st_mtime, file.parent))
     if newest is None:
         words = ["no", "" if any_file else "finished", "run", f"of {algo}" if algo else "", f"on {env}" if env else "", "in"]
-        raise ArgumentsError(f"{' '.join(filter(None, words))} {LOGS}; -f names another folder")
+        raise ArgumentsError(f"{' '.join(filter(None, words))} {folder or LOGS}; -f names another folder")
     run = newest[1]
     env_name, _, number = run.name.rpartition("_")
-    added = [names.folder[0], LOGS]
+    added = [] if folder else [names.folder[0], LOGS]
     if algo is None:
         added += [names.algo[0], run.parent.name]
     if env is None:

@@ -1,7 +1,10 @@
 """rl_zoo3's plots as a picture, on machines without a display too."""
 
+import os
 import warnings
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import ClassVar
 
 import matplotlib
 from matplotlib import pyplot as plt
@@ -10,6 +13,10 @@ from matplotlib.backend_bases import FigureCanvasBase
 from sb3_chdp.zoo_arguments import ArgumentsError, option, split_option
 
 OUTPUT = ("-o", "--output")
+# What all_plots calls its figures
+RESULTS = "Results "
+NO_EVALUATIONS = "the runs have no evaluations; train with --eval-freq"
+NO_EPISODES = "perhaps fewer episodes than -w, 100 by default"
 HEADLESS = matplotlib.get_backend().lower() == "agg"
 
 
@@ -35,6 +42,34 @@ def take_output(command: str, arguments: list[str]) -> tuple[list[str], Path | N
     return arguments, Path(output)
 
 
+class _Run(str):
+    """Name of a run's folder. rl_zoo3 looks for the environment in it: that of Goal-v0 is not a part of HardGoal-v0."""
+
+    is_exact: ClassVar[set[str]]
+
+    def __contains__(self, env: object) -> bool:
+        return self.rpartition("_")[0] == env if env in self.is_exact else super().__contains__(str(env))
+
+
+def tell_runs_apart(module: ModuleType) -> None:
+    """
+    Let a script of rl_zoo3 find the runs of the environments that are named, and no others, if there are any.
+
+    :param module: the script, which lists folders with ``os.listdir`` or ``os.scandir``
+    """
+
+    def listdir(path: str) -> list[str]:
+        names = os.listdir(path)
+        exact = type("Run", (_Run,), {"is_exact": {name.rpartition("_")[0] for name in names}})
+        return [exact(name) for name in names]
+
+    def scandir(path: str) -> list[SimpleNamespace]:
+        entries = zip(listdir(path), os.scandir(path), strict=True)
+        return [SimpleNamespace(name=name, path=e.path, stat=e.stat, is_dir=e.is_dir) for name, e in entries]
+
+    vars(module).update(os=SimpleNamespace(path=os.path, listdir=listdir, scandir=scandir))
+
+
 def show_as(path: Path | None) -> None:
     """
     Have ``plt.show`` write all figures: into the file itself, or several beside it, with their names.
@@ -53,8 +88,9 @@ def show_as(path: Path | None) -> None:
         for label in labels:
             figure = plt.figure(label)
             if not any(axes.lines for axes in figure.axes):
-                raise ArgumentsError(f"{label}: nothing to plot, perhaps fewer episodes than -w of plot, 100 by default")
-            name = label.removeprefix("Results ").replace("/", "-")
+                reason = NO_EVALUATIONS if label.startswith(RESULTS) else NO_EPISODES
+                raise ArgumentsError(f"{label}: nothing to plot, {reason}")
+            name = label.removeprefix(RESULTS).replace("/", "-")
             picture = path if len(labels) == 1 else path.with_stem(f"{path.stem}-{name}")
             figure.savefig(picture)
             print(f"Saving to {picture}")

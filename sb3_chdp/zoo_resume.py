@@ -92,6 +92,8 @@ def prepare_training(arguments: list[str]) -> list[str]:
         if len(parts) != 2 or parts[0] != "--resume":
             raise ArgumentsError(f"--resume takes the folder of a run and no other arguments, got {' '.join(arguments)}")
         run = Path(parts[1])
+        if not run.is_dir():
+            raise ArgumentsError(f"--resume: there is no folder {run}")
         if not (run / ARGUMENTS).is_file() or not CheckpointStore(run / CHECKPOINTS).generations():
             raise ArgumentsError(f"--resume: {run} holds no resumable checkpoint, which train writes with --save-freq")
         try:

@@ -290,3 +290,22 @@ def test_flattening_mends_nested_observations():
     )
     check_hybrid_env(env, warn=False)
     CHDP("MlpPolicy", env, learning_starts=5, n_diffusion_steps=2, batch_size=4).learn(10)
+
+
+class GoalEnv(LayoutEnv):
+    """What HerReplayBuffer needs."""
+
+    def __init__(self):
+        parts = {key: box(-1, 1, 2) for key in ("observation", "achieved_goal", "desired_goal")}
+        super().__init__(layouts()["shared"], spaces.Dict(parts))
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return -np.abs(achieved_goal - desired_goal).sum(axis=-1)
+
+    def step(self, action):
+        obs, _, *rest = super().step(action)
+        return obs, float(self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {})), *rest
+
+
+def test_an_environment_with_goals():
+    check_hybrid_env(GoalEnv())

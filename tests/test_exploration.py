@@ -84,6 +84,22 @@ def test_share_of_informative_returns():
     assert share_of(np.ones(5)) == share_of([]) == 1.0
 
 
+def test_rounding_is_no_difference():
+    returns = ReturnSums()
+    for i in range(100):
+        returns = returns.add(-1e3 * (1 + 1e-9 * (i % 3)))
+    assert returns.informative_share() == 0.0
+
+
+def test_many_environments_explore_until_something_is_learnt():
+    """Their steps are many before the first gradient steps."""
+    rates = {}
+    for n_envs in (1, 32):
+        model = fast_model(env=DummyVecEnv([make_layout_env] * n_envs)).learn(1600, log_interval=10**6)
+        rates[n_envs] = model._exploration_rate()
+    assert rates[32] > 0.6 > 0.3 > rates[1]
+
+
 def test_steps_that_told_nothing_do_not_count():
     rare = ReturnSums(n=1000, mean=0.02, absolute=40.0, square=20.0, cube=20.0)
     assert informative_steps(8, ReturnSums()) == 8 and 0 < informative_steps(8, rare) < 0.5

@@ -126,6 +126,13 @@ def test_batch_size_of_one():
         make_model(HPPO, make_layout_env(), batch_size=1)
 
 
+def test_a_schedule_at_the_end():
+    """The last rollout goes beyond the end of the training."""
+    model = make_model(HPPO, make_layout_env(), n_steps=10, batch_size=5, learning_rate=lambda left: 1e-3 * left)
+    model.learn(15)
+    assert model.num_timesteps == 20 and model.policy.optimizer.param_groups[0]["lr"] == 0.0
+
+
 def test_a_buffer_that_is_not_hybrid():
     with pytest.raises(ValueError, match="rollout_buffer_class must be a HybridRolloutBuffer, got"):
         make_model(HPPO, make_layout_env(), rollout_buffer_class=RolloutBuffer)

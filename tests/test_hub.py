@@ -86,6 +86,7 @@ def test_the_card(pushed, monkeypatch):
     mean = f"{np.mean(results['returns']):.2f} ± {np.std(results['returns']):.2f}"
     assert {result.metric_name: result.metric_value for result in card.data.eval_results}["mean return"] == mean
     assert f"| mean return | {mean} |" in card.text and "| success | " in card.text
+    assert f"sb3-chdp train --algo pa_td3 --env {ENV_ID} -n 64" in card.text and "'n_timesteps': 64" in card.text
     assert f"sb3-chdp load_from_hub --algo pa_td3 --env {ENV_ID} -orga me -name {NAME}" in card.text
     # The example loads the model
     monkeypatch.setattr(huggingface_hub, "hf_hub_download", lambda repo, file: str(pushed / "the_hub" / repo / file))

@@ -6,6 +6,7 @@ import torch as th
 from gymnasium import spaces
 from sb3_contrib.common.maskable.callbacks import MaskableEvalCallback
 from sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_masked_policy
+from stable_baselines3 import SAC
 from stable_baselines3.common import callbacks
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
@@ -13,11 +14,12 @@ from stable_baselines3.common.evaluation import evaluate_policy as evaluate_free
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chdp import ALGORITHMS as REGISTRY
-from sb3_chdp import HHQNTD3, HPPO, PATD3, PDQNTD3, HyARTD3, HybridActionSpec
+from sb3_chdp import HHQNTD3, HPPO, PATD3, PDQNTD3, FlattenHybridAction, HyARTD3, HybridActionSpec
+from sb3_chdp.chdp.losses import discrete_policy_loss
 from sb3_chdp.common.evaluation import evaluate_policy
 from sb3_chdp.common.masks import read_masks
 from sb3_chdp.common.utils import nearest_row
-from tests.algorithms import fast_model, has_learnt, make_model, snapshot
+from tests.algorithms import calls_of, fast_model, has_learnt, make_model, sample, snapshot
 from tests.hybrid_envs import FewValidEnv, LayoutEnv, MaskedEnv, box, layouts, make_layout_env
 
 CLASSES = [pytest.param(line.load_class(), id=name) for name, line in REGISTRY.items()]
@@ -54,9 +56,9 @@ def test_predictions(algorithm, tmp_path):
     th.manual_seed(0)
     free = model.predict(obs, deterministic=True)[0]
     np.testing.assert_equal(model.predict(obs, deterministic=True, action_masks=np.ones((30, 3), dtype=bool))[0], free)
-    with pytest.raises(ValueError, match=r"at least one discrete action, got none from environment\(s\) \[4\]"):
+    with pytest.raises(ValueError, match=r"at least one discrete action, and those of environment\(s\) \[4\] allow none"):
         model.predict(obs, action_masks=masks & (np.arange(30) != 4)[:, None])
-    with pytest.raises(ValueError, match=r"shape \(30, 3\), got shape \(30, 2\)"):
+    with pytest.raises(ValueError, match=r"3 booleans for each of 30 environment\(s\), got shape \(30, 2\)"):
         model.predict(obs, action_masks=masks[:, :2])
     model.save(tmp_path / "model")
     loaded = algorithm.load(tmp_path / "model", env=env)
@@ -83,7 +85,7 @@ def test_an_environment_that_allows_nothing(algorithm):
             return obs
 
     env = DummyVecEnv([MaskedEnv, StuckEnv])
-    with pytest.raises(ValueError, match=r"got none from environment\(s\) \[1\]"):
+    with pytest.raises(ValueError, match=r"those of environment\(s\) \[1\] allow none"):
         make_model(algorithm, env).learn(60)
 
 
@@ -164,7 +166,7 @@ def test_masks_of_parts_and_of_joint_actions():
     assert joint[0].tolist() == expected and joint[1].all()
     np.testing.assert_array_equal(read_masks(spec, joint, 2), joint)
     np.testing.assert_array_equal(read_masks(spec, joint[0], 1), joint[:1])
-    with pytest.raises(ValueError, match=r"shape \(2, 6\) or \(2, 8\), got shape \(2, 7\)"):
+    with pytest.raises(ValueError, match=r"6 or 8 booleans for each of 2 environment\(s\), got shape \(2, 7\)"):
         read_masks(spec, np.ones((2, 7), dtype=bool), 2)
     with pytest.raises(ValueError, match=r"environment\(s\) \[1\]"):
         read_masks(spec, np.array([[1, 1, 1, 1, 1, 1], [1, 1, 0, 0, 1, 1]]), 2)
@@ -211,6 +213,24 @@ def test_chdp_learns_faster_from_masks_than_from_a_penalty():
     # Chance among the four that are allowed: 0.25
     assert returns[True] > 0.9
     assert returns[False] < returns[True] - 0.5
+
+
+@pytest.mark.parametrize("layout", ["nested", "product"])
+def test_stock_algorithms_take_allowed_actions(layout):
+    """Of the flat scores those of allowed actions count: the environment raises for others."""
+    SAC("MlpPolicy", FlattenHybridAction(MaskedEnv(layout)), learning_starts=10, batch_size=8).learn(60)
+
+
+def test_chdp_learns_for_allowed_actions_alone():
+    model = fast_model(env=make_vec_env(MaskedEnv, 2)).learn(60)
+    batch = sample(model, 64)
+    features = model.critic.features(batch.observations).detach()
+    _, k = model._actions_to_improve(batch, features)
+    assert batch.masks[th.arange(64), k].all()
+    seen = calls_of(model.critic.q_networks[0])
+    discrete_policy_loss(model.policy, batch, features)
+    (_, latents, _), *_ = seen
+    assert batch.masks[th.arange(64), model.actor.codebook.quantize(latents)].all()
 
 
 def test_rl_zoo3_looks_at_an_allowed_action():

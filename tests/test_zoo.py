@@ -4,15 +4,17 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 import yaml
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_chdp import ALGORITHMS
+from sb3_chdp import ALGORITHMS, CHDP
 from sb3_chdp.cli import SCRIPTS
 from sb3_chdp.envs import ENV_IDS
+from sb3_chdp.zoo_plots import tell_runs_apart
 from tests.commands import run
 
 pytest.importorskip("rl_zoo3")
@@ -84,6 +86,20 @@ def test_all_plots(trained):
     assert (trained / "post.pkl").is_file()
 
 
+def test_runs_of_other_environments_with_longer_names(tmp_path):
+    """Goal-v0 is a part of HardGoal-v0."""
+    names = ["HardGoal-v0_1", "Goal-v0_1", "Goal-v0_12", "sb3_chdp-Goal-v0_1"]
+    for name in names:
+        (tmp_path / name).mkdir()
+    module = ModuleType("script")
+    tell_runs_apart(module)
+    listings = module.os.listdir(tmp_path), [entry.name for entry in module.os.scandir(tmp_path)]
+    for listing in listings:
+        assert sorted(name for name in listing if "Goal-v0" in name) == ["Goal-v0_1", "Goal-v0_12"]
+        assert sorted(name for name in listing if "Goal" in name) == sorted(names), "what names no environment, as in rl_zoo3"
+    assert all(entry.is_dir() for entry in module.os.scandir(tmp_path))
+
+
 def test_record(trained):
     run("record", "--env", ENV_ID, "-f", "logs", "-n", "20", "-o", "videos", cwd=trained)
     assert list((trained / "videos").glob("*.mp4"))
@@ -93,7 +109,18 @@ def test_optimize_and_train_the_best_trial(trained):
     study = ["--storage", "study.log", "--study-name", "s", "-f", "tuned"]
     run("optimize", "--env", ENV_ID, "-n", "60", "--n-trials", "2", "--n-startup-trials", "1", "--n-evaluations", "1",
         "--eval-episodes", "1", "--no-optim-plots", *study, cwd=trained)  # fmt: skip
-    run("train", "--env", ENV_ID, "-n", "60", "--eval-freq", "-1", "--trial-id", "1", *study, cwd=trained)
+    journal = optuna.storages.journal.JournalFileBackend(str(trained / "study.log"))
+    trials = optuna.load_study(study_name="s", storage=optuna.storages.JournalStorage(journal)).trials
+    models: set[Path] = set()
+    for trial in trials:
+        train = ["train", "--env", ENV_ID, "-n", "60", "--eval-freq", "-1", "--trial-id", str(trial.number), *study]
+        run(*train, cwd=trained)
+        (path,) = set((trained / "tuned").rglob(f"{ENV_ID}.zip")) - models
+        models.add(path)
+        model = CHDP.load(path)
+        assert model.gamma == pytest.approx(1 - trial.params["one_minus_gamma"])
+    message = run("train", "--env", ENV_ID, "--trial-id", "7", *study, cwd=trained, code=1)
+    assert "--trial-id 7: the study s has no such trial" in message
 
 
 def small(algo):

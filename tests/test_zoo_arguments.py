@@ -35,7 +35,9 @@ def logs(tmp_path, monkeypatch):
         ("enjoy", "--load-best --env sb3_chdp/Platform-v0", "-f logs --algo chdp --exp-id 2"),
         ("plot", "", "-f logs -a chdp -e sb3_chdp/Platform-v0"),
         ("all_plots", "--env Goal-v0", "-f logs -a hppo"),
-        ("enjoy", "--folder elsewhere", ""),
+        ("enjoy", "--folder logs --algo chdp", "--env Goal-v0 --exp-id 1"),
+        ("enjoy", "--folder elsewhere --env Goal-v0", ""),
+        ("plot", "-f elsewhere", ""),
         ("enjoy", "--help", ""),
     ],
 )
@@ -49,6 +51,7 @@ def test_the_last_run(logs, command, arguments, added):
         ("enjoy", "--algo pa_td3", "no finished run of pa_td3 in logs; -f names another folder"),
         ("record", "--env sb3_chdp/Platform-v0", "no finished run on sb3_chdp/Platform-v0 in logs"),
         ("plot", "--env Other-v0", "no run on Other-v0 in logs"),
+        ("enjoy", "--folder elsewhere", "no finished run in elsewhere"),
     ],
 )
 def test_no_such_run(logs, command, arguments, message):
@@ -60,8 +63,8 @@ def test_no_such_run(logs, command, arguments, message):
     ("command", "arguments", "prepared"),
     [
         ("train", "--algo sb3:sac --env Goal-v0", "--algo sac --env Goal-v0"),
-        ("enjoy", "--algo=sb3:sac -f logs", "--algo=sac -f logs"),
-        ("enjoy", "-f logs", "--algo chdp -f logs"),
+        ("enjoy", "--algo=sb3:sac -f logs --env Goal-v0", "--algo=sac -f logs --env Goal-v0"),
+        ("enjoy", "-f logs --env Goal-v0", "--algo chdp -f logs --env Goal-v0"),
         ("plot", "-f sb3_chdp/logs -e sb3_chdp/Goal-v0", "-a chdp -f sb3_chdp/logs -e sb3_chdp-Goal-v0"),
         ("plot", "-f a/b --env=lab/A-v0 -o x/y.png", "-a chdp -f a/b --env=lab-A-v0 -o x/y.png"),
         ("all_plots", "-f logs -e Goal-v0 -a hppo sb3:sac", "-f logs -e Goal-v0 -a hppo sac"),

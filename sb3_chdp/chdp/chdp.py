@@ -306,10 +306,11 @@ class CHDP(ExploringAlgorithm):
         """
         n_uniform = round(self.uniform_fraction * len(features))
         with th.no_grad():
-            masks = None if replay_data.masks is None else replay_data.masks[n_uniform:]
+            masks = replay_data.masks
+            masks, uniform_masks = (None, None) if masks is None else (masks[n_uniform:], masks[:n_uniform])
             latents, k = self.actor.sample_latents(features[n_uniform:], masks=masks)
             if n_uniform > 0:
-                uniform_latents, uniform_k, _ = self.actor.random_actions(n_uniform)
+                uniform_latents, uniform_k, _ = self.actor.random_actions(n_uniform, masks=uniform_masks)
                 latents, k = th.cat([uniform_latents, latents]), th.cat([uniform_k, k])
         return latents, k
 

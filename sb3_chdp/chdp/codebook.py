@@ -3,6 +3,7 @@
 import torch as th
 from torch import nn
 
+from sb3_chdp.common.product_table import random_values
 from sb3_chdp.common.utils import nearest_row
 
 
@@ -46,12 +47,15 @@ class Codebook(nn.Module):
         """
         return (self.quantize(latents) != k)[:, None]
 
-    def random(self, *shape: int, generator: th.Generator | None = None) -> th.Tensor:
+    def random(self, *shape: int, generator: th.Generator | None = None, masks: th.Tensor | None = None) -> th.Tensor:
         """
-        :param shape: how many actions
+        :param shape: how many actions; its first number is B if there are masks
         :param generator: random generator on the CPU, the global one of the codebook's device if None
+        :param masks: (B, K) False for discrete actions that may not be drawn
         :return: (*shape) uniformly random discrete actions
         """
+        if masks is not None:
+            return random_values((self.n_discrete_actions,), shape, masks, generator)[..., 0]
         device = self.codewords.device
         where = device if generator is None else "cpu"
         return th.randint(self.n_discrete_actions, shape, generator=generator, device=where).to(device)

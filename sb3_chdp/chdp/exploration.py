@@ -11,8 +11,10 @@ from sb3_chdp.chdp.policies import CHDPPolicy
 HALF_LIFE, HALF_LIFE_PER_ACTION = 500, 5
 # Before so many episodes have ended nobody knows whether success is rare
 MIN_EPISODES = 10
-# Explored actions of an episode that always remain, unless that is more than a share of all
-ACTIONS_PER_EPISODE, MAX_FINAL_RATE = 1.0, 0.1
+# Explored actions of an episode that always remain, and smallest and largest share of all actions that they may be
+ACTIONS_PER_EPISODE, MIN_FINAL_RATE, MAX_FINAL_RATE = 1.0, 0.002, 0.1
+# Returns that differ by a smaller part of their size are equal but for rounding
+ROUNDING = 1e-6
 # Smallest and largest standard deviation of the noise on scaled parameters
 NOISE_SCALES = (0.03, 1.0)
 
@@ -37,7 +39,7 @@ class ReturnSums(NamedTuple):
     def add(self, value: float) -> "ReturnSums":
         """:return: the sums with one more return"""
         n, mean, absolute, square, cube = self
-        d = value - mean if n > 0 else 0.0
+        d = value - mean if n > 0 and abs(value - mean) > ROUNDING * abs(mean) else 0.0
         return ReturnSums(n + 1, mean + (value - mean) / (n + 1), absolute + abs(d), square + d**2, cube + d**3)
 
     def informative_share(self) -> float:
@@ -67,7 +69,8 @@ def informative_steps(n_steps: int, returns: ReturnSums) -> float:
 def exploration_rate(n_steps: int, n_informative: float, n_episodes: int, n_values: int) -> float:
     """
     The rate falls with the number n of informative steps as n0 / (n0 + n), n0 = ``HALF_LIFE`` + K ``HALF_LIFE_PER_ACTION``,
-    whatever the length of the training; ``ACTIONS_PER_EPISODE`` of an episode keep exploring.
+    whatever the length of the training; ``ACTIONS_PER_EPISODE`` of an episode keep exploring, and at least
+    ``MIN_FINAL_RATE`` of all actions.
 
     :param n_steps: steps so far
     :param n_informative: informative steps so far, see :func:`informative_steps`
@@ -76,7 +79,7 @@ def exploration_rate(n_steps: int, n_informative: float, n_episodes: int, n_valu
     :return: probability of an exploratory action
     """
     half_life = HALF_LIFE + HALF_LIFE_PER_ACTION * n_values
-    final = min(ACTIONS_PER_EPISODE * n_episodes / max(n_steps, 1), MAX_FINAL_RATE)
+    final = min(max(ACTIONS_PER_EPISODE * n_episodes / max(n_steps, 1), MIN_FINAL_RATE), MAX_FINAL_RATE)
     return max(half_life / (half_life + min(n_informative, n_steps)), final)
 
 
@@ -127,7 +130,7 @@ def vary_parts(
     of_random_k = random.copy()
     with th.no_grad():
         k = th.as_tensor(columns.discrete_actions(random), device=policy.device)
-        columns.view(of_random_k, "parameters")[:] = policy.actor.sample_parameters(features, k).cpu().numpy()
+        columns.view(of_random_k, "parameters")[:] = policy.acting_actor.sample_parameters(features, k).cpu().numpy()
 
     mask, mask_of_random = (spec.mask[spec.options_of(columns.discrete_actions(x))] for x in (rows, random))
     elsewhere, nearby = rows.copy(), rows.copy()

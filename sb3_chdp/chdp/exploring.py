@@ -16,6 +16,8 @@ from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 
 # Claims of critics that have hardly learnt are no matter
 MIN_UPDATES = 200
+# Steps that count for exploration for each gradient step
+STEPS_PER_UPDATE = 4
 
 
 class ExploringAlgorithm(HybridOffPolicyAlgorithm):
@@ -50,11 +52,15 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         if reset_num_timesteps or self._last_obs is None:
             # The environment is reset: no return is that of half an episode and of another one
             self.returns_so_far = []
+        if reset_num_timesteps:
+            self.n_informative_steps, self.return_sums = 0.0, ReturnSums()
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _exploration_rate(self) -> float:
         n_values = sum(self.hybrid_space.spec.radices)
-        return exploration_rate(self.num_timesteps, self.n_informative_steps, self._episode_num, n_values)
+        # Many environments make many steps before anything is learnt from them
+        n_informative = min(self.n_informative_steps, self.learning_starts + STEPS_PER_UPDATE * self._n_updates)
+        return exploration_rate(self.num_timesteps, n_informative, self._episode_num, n_values)
 
     def _exploratory_rows(
         self, rows: np.ndarray, envs: np.ndarray, rng: np.random.Generator, masks: np.ndarray | None

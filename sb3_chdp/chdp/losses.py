@@ -28,7 +28,7 @@ def next_values(policy: CHDPPolicy, observations: PyTorchObs, masks: th.Tensor |
     min_j Q'_j(s', e', a') of the best action (e', a') among a few of the target policies.
 
     The online critics choose and the targets value, so that an error has to be in both to raise the value (double Q-learning,
-    van Hasselt et al., 2016).
+    van Hasselt et al., 2016); where features are learnt, the targets choose too.
 
     :param policy: the networks
     :param observations: (B, ...) next observations
@@ -36,7 +36,7 @@ def next_values(policy: CHDPPolicy, observations: PyTorchObs, masks: th.Tensor |
     :return: (B, 1) values in the units of the rewards, with all that follows
     """
     features = policy.critic_target.features(observations)
-    latents, _, parameters = policy.select_target(policy.actor_target, policy.critic, features, masks=masks)
+    latents, _, parameters = policy.select_target(policy.actor_target, policy.choosing_critic, features, masks=masks)
     q1, q2 = policy.critic_target.q_values(features, latents, parameters)
     return policy.value_scale.values(th.min(q1, q2))
 
@@ -107,9 +107,14 @@ def discrete_policy_loss(
     """
     actor = policy.actor
     latents = actor.discrete_policy.sample(features)
-    if parameters is None:
-        with th.no_grad():
-            parameters = actor.sample_parameters(features, actor.codebook.quantize(latents, replay_data.masks))
+    with th.no_grad():
+        k = actor.codebook.quantize(latents, replay_data.masks)
+        if parameters is None:
+            parameters = actor.sample_parameters(features, k)
+        strayed = None if replay_data.masks is None else actor.codebook.strayed(latents, k)
+    if strayed is not None:
+        # Critics know nothing of actions that may not be taken
+        latents = th.where(strayed, actor.codebook.representative_latents(k), latents)
     diffusion_loss = actor.discrete_policy.diffusion_loss(replay_data.latents, features)
     return diffusion_loss, -policy.critic.score1(features, latents, parameters).mean()
 

@@ -109,6 +109,7 @@ class CHDPPolicy(HybridPolicy):
         for target in (self.actor_target, self.critic_target):
             target.requires_grad_(False)
             target.train(False)
+        self.learns_features = any(True for _ in extractor.parameters())
         self.value_scale = ValueScale(self.adapts_values)
         self.select, self.select_deterministic, self.select_target = self._make_selections()
 
@@ -171,6 +172,18 @@ class CHDPPolicy(HybridPolicy):
         parameters = list(network.parameters())
         return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
+    # Acting and next actions have the target critics' features. Where features are learnt, those of today mean something else,
+    # and the online networks cannot read them
+    @property
+    def acting_actor(self) -> CooperativeActor:
+        """The policies that act while training."""
+        return self.actor_target if self.learns_features else self.actor
+
+    @property
+    def choosing_critic(self) -> HybridCritic:
+        """The critics that choose next actions."""
+        return self.critic_target if self.learns_features else self.critic
+
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(obs, deterministic)
 
@@ -190,7 +203,7 @@ class CHDPPolicy(HybridPolicy):
         if deterministic:
             select, actor, fixed = self.select_deterministic, self.actor_target, self._fixed_draws(observation)
         else:
-            select, actor, fixed = self.select, self.actor, None
+            select, actor, fixed = self.select, self.acting_actor, None
         latents, k, parameters = select(actor, self.critic_target, features, fixed, action_masks)
         return self.action_space.columns.pack(discrete_actions=k.float(), parameters=parameters, latents=latents)
 

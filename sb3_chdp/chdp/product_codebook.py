@@ -43,13 +43,14 @@ class ProductCodebook(ProductTable):
         """
         return (self.quantize(latents) != k)[:, self.choice_of_slot]
 
-    def random(self, *shape: int, generator: th.Generator | None = None) -> th.Tensor:
+    def random(self, *shape: int, generator: th.Generator | None = None, masks: th.Tensor | None = None) -> th.Tensor:
         """
-        :param shape: how many actions
+        :param shape: how many actions; its first number is B if there are masks
         :param generator: random generator on the CPU, the global one if None
+        :param masks: (B, sum of the radices) False for values that may not be drawn
         :return: (*shape, L) uniformly random discrete actions
         """
-        return random_values(self.radices, shape, generator=generator).to(self.vectors.device)
+        return random_values(self.radices, shape, masks, generator).to(self.vectors.device)
 
     def alternatives(self, k: th.Tensor, n: int, repeatable: bool) -> th.Tensor:
         """

@@ -38,9 +38,9 @@ class ValueScale(nn.Module):
     def values(self, outputs: th.Tensor) -> th.Tensor:
         """
         :param outputs: (B, 1) what critics put out
-        :return: (B, 1) values in the units of the rewards
+        :return: (B, 1) values in the units of the rewards, in double precision: small differences of large values count
         """
-        return (self.center[0] + self.scale * outputs.double()).float()
+        return self.center[0] + self.scale * outputs.double()
 
     def outputs(self, targets: th.Tensor) -> th.Tensor:
         """

@@ -197,6 +197,10 @@ class HybridAlgorithm(BaseAlgorithm):
         check(number(), learning_rate=self.lr_schedule(self._current_progress_remaining))
         super()._update_learning_rate(optimizers)
 
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        # The last rollout may go beyond the end: no schedule is asked about less than nothing
+        super()._update_current_progress_remaining(min(num_timesteps, total_timesteps), total_timesteps)
+
     def _update_own_learning_rate(self, optimizer: th.optim.Optimizer, name: str, schedule: Schedule) -> None:
         """
         SB3's ``_update_learning_rate`` for what does not learn at the rate ``learning_rate``.

@@ -29,14 +29,16 @@ def read_masks(spec: HybridActionSpec, masks: Any, n: int, first: int = 0) -> np
     array = given.reshape(-1, given.shape[-1]) if given.ndim else given
     accepted = sorted({spec.n_mask_values, sum(spec.radices)})
     if array.ndim != 2 or len(array) != n or array.shape[1] not in accepted:
-        lengths = " or ".join(f"({n}, {m})" for m in accepted)
-        raise ValueError(f"action_masks must be booleans of shape {lengths}, got shape {given.shape}")
+        lengths = " or ".join(map(str, accepted))
+        raise ValueError(f"action_masks must be {lengths} booleans for each of {n} environment(s), got shape {given.shape}")
     if array.shape[1] == spec.n_mask_values:
         array = spec.join_masks(array)
     table, exists = value_table(spec.radices)
     stuck = (first + np.flatnonzero(~(array[:, table] & exists).any(axis=2).all(axis=1))).tolist()
     if stuck:
-        raise ValueError(f"action_masks must allow at least one discrete action, got none from environment(s) {stuck}")
+        raise ValueError(
+            f"action_masks must allow at least one discrete action, and those of environment(s) {stuck} allow none"
+        )
     return array
 
 

@@ -51,7 +51,8 @@ class HybridActionSpec:
     :param space: the native action space
     :param layout: "auto" (the rules above), "per_action", "shared", "joint" (shared, one index) or "factored" (shared)
     :raises ValueError: for a space without discrete or continuous part, with unbounded or non-numeric boxes, with other
-        kinds of leaves, with more than 65,536 discrete actions that are not factored, or with a single choice that shall be
+        kinds of leaves, with more than 65,536 discrete actions that are not factored, or with a single discrete part that
+        shall be factored
     """
 
     def __init__(self, space: spaces.Space[Any], layout: str = "auto"):
@@ -170,6 +171,12 @@ class HybridActionSpec:
         :return: (n,) their rows in the tables of parameters: ``mask`` and ``parameter_index``
         """
         return choices if choices.ndim == 1 else choices[:, 0] * 0
+
+    def __repr__(self) -> str:
+        sizes = sorted({*self.mask.sum(axis=1).tolist()})
+        discrete = f"{len(self.radices)} choices" if self.is_factored else f"{self.n_discrete_actions} discrete actions"
+        of_actions = f"{sizes[0]} shared parameters" if self.is_shared else f"{' or '.join(map(str, sizes))} parameters each"
+        return f"HybridActionSpec({discrete}, {of_actions})"
 
     def to_native(self, row: npt.ArrayLike) -> Any:
         """

@@ -36,6 +36,7 @@ def make_card(
     model_file: str,
     evaluation: Evaluation,
     hyperparams: Mapping[str, Any],
+    n_timesteps: int,
     has_video: bool,
 ) -> ModelCard:
     """
@@ -45,6 +46,7 @@ def make_card(
     :param model_file: the model in it
     :param evaluation: what the model achieves
     :param hyperparams: those of the training
+    :param n_timesteps: number of steps that the model was trained for
     :param has_video: whether there is a ``replay.mp4``, which the Hub shows beside the card
     :return: the card
     """
@@ -106,13 +108,13 @@ sb3-chdp enjoy {algo_option} --env {env_id}
 ## Train
 
 ```bash
-sb3-chdp train {algo_option} --env {env_id}
+sb3-chdp train {algo_option} --env {env_id} -n {n_timesteps}
 ```
 
-with the hyperparameters
+The hyperparameters were these; `-params` or a file for `-conf` sets what differs from the file of today.
 
 ```python
-{pformat(dict(hyperparams), sort_dicts=True)}
+{pformat({**hyperparams, 'n_timesteps': n_timesteps}, sort_dicts=True)}
 ```
 """
     return ModelCard(f"---\n{data.to_yaml()}\n---\n{text}")

@@ -120,7 +120,8 @@ def make_repository(args: argparse.Namespace, folder: Path) -> str:
     with zipfile.ZipFile(folder / "train_eval_metrics.zip", "w") as archive:
         for file in (*Path(log_path).glob("evaluations.npz"), *Path(log_path).glob("*.monitor.csv")):
             archive.write(file, file.name)
-    card = make_card(algo, env_name.gym_id, repo_id, model_name.filename, evaluation, published, not args.no_render)
+    n_timesteps, has_video = model.num_timesteps, not args.no_render
+    card = make_card(algo, env_name.gym_id, repo_id, model_name.filename, evaluation, published, n_timesteps, has_video)
     card.save(folder / "README.md")
     return repo_id
 
