@@ -66,6 +66,13 @@ def test_intervals_are_reproducible_and_hold_the_point():
     assert iqm(scores + 0.0) == (middle, low, high)
 
 
+def test_runs_without_a_gradient_step_are_named():
+    results = make_results({("hppo", "E"): 10.0, ("chdp", "E"): 20.0})
+    results.loc[results["row"] == "hppo", "gradient_steps"] = 0
+    text = tables.report(scores_of(results), ["chdp", "hppo"], ["E"])
+    assert text.endswith("**Not trained**: HPPO on E. Too few environment steps for a single gradient step.")
+
+
 def test_probability_of_improvement():
     assert probability_of_improvement([3.0, 4.0], [1.0, 2.0])[0] == 1
     assert probability_of_improvement([1.0, 2.0], [1.0, 2.0])[0] == 0.5

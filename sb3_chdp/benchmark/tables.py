@@ -95,7 +95,15 @@ def improvement_table(scores: pd.DataFrame, rows: list[str], envs: list[str]) ->
     return markdown(header, lines) if lines else ""
 
 
+def untrained(scores: pd.DataFrame) -> str:
+    """:return: a sentence about runs that ended before their first gradient step, "" if there are none"""
+    without = scores[scores["gradient_steps"] == 0][["row", "env"]].drop_duplicates().itertuples(index=False)
+    names = ", ".join(f"{display_name(row)} on {env}" for row, env in without)
+    return names and f"**Not trained**: {names}. Too few environment steps for a single gradient step."
+
+
 def report(scores: pd.DataFrame, rows: list[str], envs: list[str], columns: Mapping[str, Column] | None = None) -> str:
     """:return: all tables"""
     parts = [score_table(scores, rows, envs, columns), aggregate_table(scores, rows), improvement_table(scores, rows, envs)]
+    parts.append(untrained(scores))
     return "\n\n".join(part for part in parts if part)

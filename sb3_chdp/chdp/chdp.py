@@ -29,7 +29,7 @@ from sb3_chdp.common.samples import HybridReplaySamples
 from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.common.utils import TargetUpdate, gradient_step
 
-# By default
+# High at first, and 0 in the end: what is learnt settles
 LEARNING_RATE = LinearSchedule(1e-3, 0.0, 1.0)
 
 

@@ -86,8 +86,7 @@ def expected_outcomes(policy: CHDPPolicy, features: th.Tensor, rows: np.ndarray)
     latents, parameters = columns.view(actions, "latents"), columns.view(actions, "parameters")
     critic = policy.critic_target
     values = th.stack(critic.q_values(features, latents, parameters)).mean(dim=0)
-    if critic.reward_network is None:
-        return th.cat([values, th.zeros_like(values)], dim=1)
+    assert critic.reward_network is not None, "PaperCHDP does not explore"
     return th.cat([values, critic.reward_network(features, latents, parameters)], dim=1)
 
 

@@ -1,4 +1,4 @@
-"""The losses of CHDP, one function for each of the paper's equations, and the relabelling of stored latents."""
+"""The losses of CHDP, most of them an equation of the paper, and the relabelling of stored latents."""
 
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs

@@ -19,8 +19,8 @@ SMALL_ENTRY = 2.0**-20
 # Together they enlarge differences between observations some 100,000 times: noise is unrelated from a difference of 1e-4 on.
 # Rounding errors, which no two runtimes share, grow likewise, and have to stay small
 OBSERVATION_FREQUENCY, MIXING, VALUE_FREQUENCY = 64.0, 2.0, 256
-# The largest float32 below 1; and what keeps noise below 4.4 in size, where rounding errors would show
-BELOW_ONE, SMALLEST = 1 - 2.0**-24, 2.0**-14
+# What keeps noise below 4.4 in size, where rounding errors would show
+SMALLEST = 2.0**-14
 FULL_TURN = float(np.float32(2 * math.pi))
 
 
@@ -37,25 +37,14 @@ def _value_frequencies(n_values: int, seed: int) -> np.ndarray:
     return np.random.RandomState(seed).randint(1, VALUE_FREQUENCY, (N_PHASES, n_values)).astype(np.float64)
 
 
-def repeatable_uniform(observations: PyTorchObs, *shape: int, seed: int = 0) -> th.Tensor:
+def _fractions(observations: PyTorchObs, n_values: int, seed: int) -> th.Tensor:
     """
-    Uniform numbers that depend on each observation alone, not on the rest of the batch.
-
     The entries of an observation, on a logarithmic scale, are added up with large random weights. Of the sums the fractions
     count, the phases. They are mixed by a sine, without which observations of few bits have related numbers. The numbers
     are the fractions of whole multiples of the phases.
 
-    :param observations: batch of B observations: numbers of any kind, flat, images or a dict of these
-    :param shape: of what each observation gets
-    :param seed: another one gives unrelated numbers
-    :return: (B, *shape) float32 numbers in [0, 1)
+    :return: (B, n_values) uniform float64 numbers in [0, 1)
     """
-    values = _fractions(observations, math.prod(shape), seed)
-    return values.float().clamp(max=BELOW_ONE).reshape(-1, *shape)
-
-
-def _fractions(observations: PyTorchObs, n_values: int, seed: int) -> th.Tensor:
-    """:return: (B, n_values) float64 numbers in [0, 1)"""
     # Sorted, as the order of the keys depends on where a dict comes from
     parts = [observations[key] for key in sorted(observations)] if isinstance(observations, dict) else [observations]
     entries = th.cat([part.reshape(part.shape[0], -1).double() for part in parts], dim=1)
@@ -73,9 +62,9 @@ def _fraction(numbers: th.Tensor) -> th.Tensor:
 
 def repeatable_noise(observations: PyTorchObs, *shape: int, seed: int = 0) -> th.Tensor:
     """
-    Standard normal noise that depends on each observation alone, not on the rest of the batch; see :func:`repeatable_uniform`.
+    Standard normal noise that depends on each observation alone, not on the rest of the batch.
 
-    Two uniform numbers make two normal ones (Box and Muller, 1958).
+    Numbers that look uniform are made of the observation, and two of them make two normal ones (Box and Muller, 1958).
 
     :param observations: batch of B observations: numbers of any kind, flat, images or a dict of these
     :param shape: of what each observation gets
