@@ -16,6 +16,8 @@ from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 
 # Claims of critics that have hardly learnt are no matter
 MIN_UPDATES = 200
+# In the critics' units; a single one is not to decide about claims
+LARGEST_OUTCOME = 20.0
 # Steps that count for exploration for each gradient step
 STEPS_PER_UPDATE = 4
 
@@ -100,12 +102,13 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         next_masks = None if masks is None else th.as_tensor(masks, device=self.device)
         values = next_values(self.policy, self.policy.obs_to_tensor(new_obs)[0], next_masks)
         came = th.as_tensor(rewards + self.gamma * (1 - dones) * values.flatten().cpu().numpy(), device=self.device)
-        outputs = self.policy.value_scale.outputs(th.stack([came, came], dim=1))[:, 0].tolist()
+        outputs = self.policy.value_scale.outputs(th.stack([came, came], dim=1))[:, 0]
+        outcomes = outputs.clamp(-LARGEST_OUTCOME, LARGEST_OUTCOME).tolist()
         sums = ForesightSums(*self.foresight_sums)  # a list in a loaded model
         for i, reward, follows, expected in zip(claims.envs, claims.rewards, claims.follows, claims.expected, strict=True):
             # A new episode has begun where a time limit was reached: its first state is not what followed
             if not infos[i].get("TimeLimit.truncated", False):
-                sums = sums.add(float(reward), float(follows), outputs[i] - float(expected))
+                sums = sums.add(float(reward), float(follows), outcomes[i] - float(expected))
         self.foresight_sums = sums
         self.policy.set_foresight(sums.weight())
 

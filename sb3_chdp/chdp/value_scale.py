@@ -6,8 +6,6 @@ from torch import nn
 # Weight of a batch in the statistics; more at first, when they are plain averages
 MIN_UPDATE_WEIGHT = 0.005
 MIN_SCALE = 1e-8
-# A first reward after none may lie far beyond the scale so far
-MAX_OUTPUT = 20.0
 
 
 class ValueScale(nn.Module):
@@ -45,10 +43,10 @@ class ValueScale(nn.Module):
     def outputs(self, targets: th.Tensor) -> th.Tensor:
         """
         :param targets: (B, 2) values and rewards, in the units of the rewards
-        :return: (B, 2) what the networks put out for them, at most ``MAX_OUTPUT`` from 0 if the scale adapts
+        :return: (B, 2) what the networks put out for them; of a batch that the statistics have seen, values of at most
+            (B / ``MIN_UPDATE_WEIGHT``)^(1/2) from 0
         """
-        outputs = ((targets.double() - self.center) / self.scale).float()
-        return outputs.clamp(-MAX_OUTPUT, MAX_OUTPUT) if self.adapts else outputs
+        return ((targets.double() - self.center) / self.scale).float()
 
     @th.no_grad()
     def update(self, targets: th.Tensor) -> tuple[th.Tensor, th.Tensor] | None:
