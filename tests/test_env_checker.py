@@ -296,7 +296,7 @@ class GoalEnv(LayoutEnv):
     """What HerReplayBuffer needs."""
 
     def __init__(self):
-        parts = {key: box(-1, 1, 2) for key in ("observation", "achieved_goal", "desired_goal")}
+        parts: dict[str, spaces.Space] = dict.fromkeys(("observation", "achieved_goal", "desired_goal"), box(-1, 1, 2))
         super().__init__(layouts()["shared"], spaces.Dict(parts))
 
     def compute_reward(self, achieved_goal, desired_goal, info):
