@@ -107,14 +107,9 @@ def discrete_policy_loss(
     """
     actor = policy.actor
     latents = actor.discrete_policy.sample(features)
-    with th.no_grad():
-        k = actor.codebook.quantize(latents, replay_data.masks)
-        if parameters is None:
-            parameters = actor.sample_parameters(features, k)
-        strayed = None if replay_data.masks is None else actor.codebook.strayed(latents, k)
-    if strayed is not None:
-        # Critics know nothing of actions that may not be taken
-        latents = th.where(strayed, actor.codebook.representative_latents(k), latents)
+    if parameters is None:
+        with th.no_grad():
+            parameters = actor.sample_parameters(features, actor.codebook.quantize(latents, replay_data.masks))
     diffusion_loss = actor.discrete_policy.diffusion_loss(replay_data.latents, features)
     return diffusion_loss, -policy.critic.score1(features, latents, parameters).mean()
 
