@@ -131,7 +131,7 @@ class HyARTD3(HybridTD3):
         return {**super()._network_kwargs(), "embedding_dim": self.embedding_dim}
 
     def _setup_model(self) -> None:
-        if self.optimize_memory_usage:
+        if self.optimize_memory_usage is True:
             raise ValueError(
                 "optimize_memory_usage must be False for HyARTD3, got True: the representation learns from what follows an "
                 "action, and such a buffer gives the first state of the next episode for what follows the last one"
