@@ -111,18 +111,14 @@ def test_policies_are_updated_every_time_at_a_constant_rate():
 
 
 def test_gradients_are_bounded():
-    """With rewards of any size; Adam, which would hide it, is not used."""
-    for algorithm_class in (PaperCHDP, CHDP):
-        policy_kwargs = dict(net_arch=[16], optimizer_class=th.optim.SGD)
-        model = filled_model(algorithm_class=algorithm_class, policy_kwargs=policy_kwargs)
-        model.replay_buffer.rewards[:] *= 1e4
-        model.replay_buffer.rewards[:] += 1e4
-        networks = [network for network in (model.critic.q_networks, model.critic.reward_network) if network is not None]
-        before = [parameters_to_vector(network.parameters()).detach() for network in networks]
-        model.train(1, 32)
-        for network, old in zip(networks, before, strict=True):
-            step = (parameters_to_vector(network.parameters()) - old).norm().item() / 1e-3
-            assert step == pytest.approx(model.critic_max_grad_norm, rel=0.01)
+    """With large rewards, which PaperCHDP brings into no other units; Adam, which would hide it, is not used."""
+    policy_kwargs = dict(net_arch=[16], optimizer_class=th.optim.SGD)
+    model = filled_model(algorithm_class=PaperCHDP, policy_kwargs=policy_kwargs)
+    model.replay_buffer.rewards[:] += 1e4
+    before = parameters_to_vector(model.critic.q_networks.parameters()).detach()
+    model.train(1, 32)
+    step = (parameters_to_vector(model.critic.q_networks.parameters()) - before).norm().item() / 1e-3
+    assert step == pytest.approx(model.critic_max_grad_norm, rel=0.01)
 
 
 def test_arguments_are_a_part_of_chdps():
