@@ -58,14 +58,19 @@ def tell_runs_apart(module: ModuleType) -> None:
     :param module: the script, which lists folders with ``os.listdir`` or ``os.scandir``
     """
 
-    def listdir(path: str) -> list[str]:
-        names = os.listdir(path)
+    def runs(names: list[str]) -> list[str]:
         exact = type("Run", (_Run,), {"is_exact": {name.rpartition("_")[0] for name in names}})
         return [exact(name) for name in names]
 
+    def listdir(path: str) -> list[str]:
+        return runs(os.listdir(path))
+
     def scandir(path: str) -> list[SimpleNamespace]:
-        entries = zip(listdir(path), os.scandir(path), strict=True)
-        return [SimpleNamespace(name=name, path=e.path, stat=e.stat, is_dir=e.is_dir) for name, e in entries]
+        entries = list(os.scandir(path))
+        names = runs([entry.name for entry in entries])
+        return [
+            SimpleNamespace(name=n, path=e.path, stat=e.stat, is_dir=e.is_dir) for n, e in zip(names, entries, strict=True)
+        ]
 
     vars(module).update(os=SimpleNamespace(path=os.path, listdir=listdir, scandir=scandir))
 

@@ -49,6 +49,7 @@ def test_own_environment(algo, settings, run_that, tmp_path):
     run("train", "--algo", algo, "--env", "Own-v0", "--gym-packages", "mine", "-n", "60", "--eval-freq", "30",
         "--eval-episodes", "2", "-params", *settings, cwd=tmp_path)  # fmt: skip
     folder = tmp_path / "logs" / algo.removeprefix("sb3:") / "Own-v0_1"
+    assert (folder / "Own-v0" / "vecnormalize.pkl").is_file(), "the block default normalises"
     which = [*run_that, "--gym-packages", "mine"]
     run("enjoy", *which, "--no-render", "-n", "20", cwd=tmp_path)
     run("record", *which, "-n", "5", cwd=tmp_path)
@@ -58,6 +59,16 @@ def test_own_environment(algo, settings, run_that, tmp_path):
     assert (tmp_path / "plot.png").is_file() and (tmp_path / "all.png").is_file()
     message = run("enjoy", "--no-render", cwd=tmp_path, code=1)
     assert message == "sb3-chdp enjoy: unknown environment 'Own-v0' (--gym-packages names the module that registers it)\n"
+
+
+def test_observations_that_cannot_be_normalized(tmp_path):
+    (tmp_path / "mine.py").write_text(
+        OWN_ENV.replace("observation_space = Box(-1, 1, (2,))", "observation_space = Discrete(3)").replace(
+            "np.zeros(2, np.float32)", "np.int64(1)"
+        )
+    )
+    run("train", "--algo", "hppo", "--env", "Own-v0", "--gym-packages", "mine", "-n", "20", "--eval-freq", "-1",
+        "-params", "n_steps:5", "batch_size:10", cwd=tmp_path)  # fmt: skip
 
 
 MASKED_ENV = """
