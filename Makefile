@@ -9,7 +9,7 @@ SOURCES := sb3_chdp tests benchmarks docs examples
 # Small networks are fastest on one thread
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: train test format lint type check-codestyle docs package hooks speed clean-env
+.PHONY: train test notebooks format lint type check-codestyle docs package hooks speed clean-env
 
 $(STAMP): setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -22,7 +22,10 @@ train: $(STAMP)
 	$(BIN)/sb3-chdp enjoy --env Platform-v0 --folder logs --no-render --n-timesteps 1000 | grep --invert-match "^Episode "
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -q --nbmake notebooks tests
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -q tests
+
+notebooks: $(STAMP)
+	$(BIN)/python -m pytest -n 2 -q --nbmake notebooks
 
 format: $(STAMP)
 	$(BIN)/ruff check --select I --fix $(SOURCES)

@@ -23,6 +23,7 @@ from sb3_chdp.benchmark.manager import RunManager, settings_of
 from sb3_chdp.benchmark.results import FIELDS, ResultsError, append_row, read_results, read_rows, write_rows
 from sb3_chdp.benchmark.runs import Run
 from sb3_chdp.benchmark.training import forget, train
+from tests.commands import start
 
 ENV_ID = "HardMove4-v0"
 ROOT = Path(__file__).parent.parent
@@ -42,9 +43,7 @@ def make_run(folder, algo="hppo", n_timesteps=240, **kwargs):
 
 def started(run):
     """A process that trains a run; it is left to the caller to end it."""
-    code = f"from sb3_chdp.benchmark.runs import Run; from sb3_chdp.benchmark.training import train; train({run!r})"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.DEVNULL)
+    return start(train, run, cwd=ROOT)
 
 
 def wait_for(condition, seconds=600):
@@ -72,7 +71,7 @@ def test_a_killed_run_goes_on_to_the_last_bit(algo, tmp_path):
             train(run)
     finally:
         process.kill()
-        process.wait()
+        process.join()
     before = run.rows()
     train(run)
     rows = run.rows()
@@ -104,7 +103,7 @@ def test_damaged_checkpoints_of_a_run(tmp_path):
         wait_for(lambda: len(list(run.checkpoints.glob("0*_steps"))) == 2)
     finally:
         process.kill()
-        process.wait()
+        process.join()
     for generation in run.checkpoints.glob("0*_steps"):
         (generation / "state.json").write_text("{}")
     with (
@@ -122,7 +121,7 @@ def test_checkpoints_without_settings_are_not_used(tmp_path):
         wait_for(lambda: list(run.checkpoints.glob("0*_steps")))
     finally:
         process.kill()
-        process.wait()
+        process.join()
     run.started.write_text("{")
     changed = replace(run, overrides={**run.overrides, "gamma": 0.5, "n_timesteps": 240})
     with pytest.raises(ResultsError, match=r"started\.json is damaged .*: delete it, and the run is trained anew"):

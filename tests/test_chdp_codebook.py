@@ -82,7 +82,7 @@ def test_codewords_stay_apart_where_all_actions_are_worth_the_same(reward):
     env = ConstantEnv(spaces.Tuple((spaces.Discrete(8), box(-1, 1, 1))))
     model = filled_model(env, n_transitions=300, latent_dim=8)
     before = th.pdist(model.actor.codebook.codewords.detach())
-    model.train(1500, 32)
+    model.train(700, 32)
     for actor in (model.actor, model.actor_target):
         codewords = actor.codebook.codewords.detach()
         assert (actor.codebook.quantize(codewords) == th.arange(8)).all()

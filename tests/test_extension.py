@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.commands import run
+
 pytest.importorskip("rl_zoo3")
 pytest.importorskip("submitit")
 
@@ -17,7 +19,7 @@ ROOT = Path(__file__).parent.parent
 GUIDE = ROOT / "docs" / "guide"
 PNG = b"\x89PNG"
 # After the commands of the guides, which are meant for patient readers
-QUICK = {"train": ["--eval-freq", "-1"], "benchmark": ["--eval-episodes", "2", "--jobs", "2"]}
+QUICK = {"train": ["-n", "400", "--eval-freq", "-1"], "benchmark": ["--steps", "400", "--eval-episodes", "2", "--jobs", "2"]}
 
 
 def blocks(page, language):
@@ -29,12 +31,12 @@ def commands(page):
     return [shlex.split(line) for block in blocks(page, "bash") for line in block.splitlines()]
 
 
-def run(command, folder, package):
+def run_in_copy(command, folder):
+    """Run a command in a folder that holds a copy of the package."""
     if command[0] == "sb3-chdp":
-        command = [sys.executable, "-m", "sb3_chdp", *command[1:], *QUICK[command[1]]]
-    else:
-        command = [sys.executable, *command[1:]]
-    environment = {**os.environ, "PYTHONPATH": str(package), "OMP_NUM_THREADS": "1"}
+        command = ["python", "-m", "sb3_chdp", *command[1:], *QUICK[command[1]]]
+    environment = {**os.environ, "PYTHONPATH": str(folder), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, *command[1:]]
     result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=1800)
     assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout
@@ -59,11 +61,11 @@ def test_new_algorithm(tmp_path):
     registry.write_text(registry.read_text()[:last_line] + line + registry.read_text()[last_line:])
 
     train, benchmark, tests = commands("new_algorithm.md")
-    run(train, tmp_path, tmp_path)
+    run_in_copy(train, tmp_path)
     assert (tmp_path / "logs" / "slow_td3" / "HardMove4-v0_1" / "HardMove4-v0.zip").is_file()
-    assert "| HardMove4-v0 | Slow TD3 |" in run(benchmark, tmp_path, tmp_path)
+    assert "| HardMove4-v0 | Slow TD3 |" in run_in_copy(benchmark, tmp_path)
     check_report(tmp_path / "logs" / "benchmark", "P(Slow TD3 > ...)", "PA-TD3")
-    assert re.search(r"[1-9]\d* passed", run(tests, tmp_path, tmp_path))
+    assert re.search(r"[1-9]\d* passed", run_in_copy(tests, tmp_path))
 
 
 def test_new_env(tmp_path):
@@ -71,7 +73,7 @@ def test_new_env(tmp_path):
     (code,) = blocks("new_env.md", "python")
     (tmp_path / "valve_envs.py").write_text(code)
     train, benchmark = commands("new_env.md")
-    run(train, tmp_path, ROOT)
+    run(*train[1:], *QUICK["train"], cwd=tmp_path)
     assert (tmp_path / "logs" / "pdqn_td3" / "Tank-v0_1" / "Tank-v0.zip").is_file()
-    assert "| Tank-v0 | PDQN-TD3 | return |" in run(benchmark, tmp_path, ROOT)
+    assert "| Tank-v0 | PDQN-TD3 | return |" in run(*benchmark[1:], *QUICK["benchmark"], cwd=tmp_path)
     check_report(tmp_path / "logs" / "benchmark", "PDQN-TD3", "PA-TD3")

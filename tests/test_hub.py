@@ -1,30 +1,27 @@
 """Models on the Hub: built, published and loaded without a network."""
 
 import json
-import os
 import re
+import shutil
 import subprocess
-import sys
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
 import sb3_chdp
+from tests import commands
 
-pytest.importorskip("rl_zoo3")
+load_from_hub = pytest.importorskip("rl_zoo3.load_from_hub")
 huggingface_hub = pytest.importorskip("huggingface_hub")
 
 ENV_ID = "HardMove4-v0"
 NAME = f"pa_td3-{ENV_ID}"
 # A Hub that is a folder, in which repositories lie by name
-SETUP = """
-import pathlib, shutil, sys, types
-import huggingface_hub
-import huggingface_sb3
-from rl_zoo3 import load_from_hub
+HUB = Path("the_hub")
 
-HUB = pathlib.Path("the_hub")
 
 def download(repo_id, filename, **kwargs):
     path = HUB / repo_id / filename
@@ -32,27 +29,25 @@ def download(repo_id, filename, **kwargs):
         raise load_from_hub.HTTPError(filename)
     return str(path)
 
+
 class Api:
     def create_repo(self, repo_id, exist_ok):
         return "https://hub/" + repo_id
+
     def upload_folder(self, repo_id, folder_path, commit_message):
         shutil.copytree(folder_path, HUB / repo_id, dirs_exist_ok=True)
+
     def list_repo_files(self, repo_id):
         return [path.name for path in (HUB / repo_id).iterdir()]
 
-huggingface_hub.HfApi, huggingface_hub.hf_hub_download, load_from_hub.load_from_hub = Api, download, download
-sys.argv = ["sb3-chdp", *sys.argv[1:]]
-from sb3_chdp.cli import main
-main()
-"""
+
+def main_with_hub(*arguments):
+    """The command, which takes the folder for the Hub."""
+    huggingface_hub.HfApi, huggingface_hub.hf_hub_download, load_from_hub.load_from_hub = Api, download, download
+    commands.main(*arguments)
 
 
-def run(*arguments, cwd, code=0):
-    environment = {**os.environ, "SDL_VIDEODRIVER": "dummy", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", SETUP, *arguments]
-    result = subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300)
-    assert result.returncode == code, result.stdout + result.stderr
-    return result.stdout + result.stderr
+run = partial(commands.run, main=main_with_hub)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """The command line, really run on tiny budgets."""
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +14,7 @@ from sb3_chdp import ALGORITHMS, CHDP
 from sb3_chdp.cli import SCRIPTS
 from sb3_chdp.envs import ENV_IDS
 from sb3_chdp.zoo_plots import tell_runs_apart
-from tests.commands import run
+from tests.commands import main, run, start
 
 pytest.importorskip("rl_zoo3")
 optuna = pytest.importorskip("optuna")
@@ -143,16 +142,11 @@ def test_every_algorithm(algo, tmp_path):
 def test_two_processes_tune_one_study(tmp_path):
     """What several machines do, with the journal on a file system that they share."""
     study = ["--storage", "study.log", "--study-name", "both", "--no-optim-plots", "--n-evaluations", "1"]
-    command = [sys.executable, "-m", "sb3_chdp", "optimize", "--algo", "hppo", "--env", ENV_ID, "-n", "60", "--n-trials", "2",
-               "--eval-episodes", "1", *study]  # fmt: skip
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    processes = [
-        subprocess.Popen(
-            [*command, "-f", f"tuned{i}", "--seed", str(i)], cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL
-        )
-        for i in range(2)
-    ]
-    assert [process.wait(timeout=300) for process in processes] == [0, 0]
+    command = ["optimize", "--algo", "hppo", "--env", ENV_ID, "-n", "60", "--n-trials", "2", "--eval-episodes", "1", *study]
+    processes = [start(main, *command, "-f", f"tuned{i}", "--seed", str(i), cwd=tmp_path) for i in range(2)]
+    for process in processes:
+        process.join(timeout=300)
+    assert [process.exitcode for process in processes] == [0, 0]
     storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(tmp_path / "study.log")))
     trials = optuna.load_study(study_name="both", storage=storage).trials
     assert [trial.number for trial in trials] == [0, 1, 2, 3]
