@@ -113,7 +113,7 @@ def test_what_is_left_is_the_full_algorithm(table):
     for model in models.values():
         assert type(model).train is CHDP.train
         assert inspect.signature(type(model)) == inspect.signature(type(full))
-        for attribute in ("uniform_fraction", "critics_train_codebook", "critic_max_grad_norm"):
+        for attribute in ("uniform_fraction", "critics_train_codebook", "max_grad_norm"):
             assert getattr(model, attribute) == getattr(full, attribute)
         assert [type(q_net) for q_net in model.critic.q_networks] == [type(q_net) for q_net in full.critic.q_networks]
         assert model.policy.select_target == full.policy.select_target and model.policy.select == full.policy.select

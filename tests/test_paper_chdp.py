@@ -118,7 +118,7 @@ def test_gradients_are_bounded():
     before = parameters_to_vector(model.critic.q_networks.parameters()).detach()
     model.train(1, 32)
     step = (parameters_to_vector(model.critic.q_networks.parameters()) - before).norm().item() / 1e-3
-    assert step == pytest.approx(model.critic_max_grad_norm, rel=0.01)
+    assert step == pytest.approx(model.max_grad_norm, rel=0.01)
 
 
 def test_arguments_are_a_part_of_chdps():

@@ -112,9 +112,9 @@ class CHDP(ExploringAlgorithm):
     uniform_fraction: ClassVar[float] = 0.5
     # Whether the critics' loss trains the codebook
     critics_train_codebook: ClassVar[bool] = True
-    # Bounds on the gradient norm: a narrow one on critics would let a rare large error count as any other
-    policy_max_grad_norm: ClassVar[float] = 1.0
-    critic_max_grad_norm: ClassVar[float] = 10.0
+    # Bound on the gradient norm of every network. Most batches of the critics reach it, and count alike: with a wider one they
+    # forget now and then what they had learnt
+    max_grad_norm: ClassVar[float] = 1.0
 
     policy: CHDPPolicy
     actor: CooperativeActor
@@ -233,7 +233,7 @@ class CHDP(ExploringAlgorithm):
             features = policy.critic.features(replay_data.observations)
             self.update_targets.copy_statistics()
             loss, q1, errors = critic_loss(policy, replay_data, features, targets[:, :1])
-            gradient_step(loss, critic_optimizers, self.critic_max_grad_norm, "critic_loss")
+            gradient_step(loss, critic_optimizers, self.max_grad_norm, "critic_loss")
             policy.actor.codebook.project()
             if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
                 assert replay_data.indices is not None, "a prioritised buffer says where its samples are"
@@ -243,7 +243,7 @@ class CHDP(ExploringAlgorithm):
             # The reward alone, for foresight; PaperCHDP has none
             if policy.reward_optimizer is not None:
                 loss = reward_loss(policy, replay_data, features, targets[:, 1:])
-                gradient_step(loss, [policy.reward_optimizer], self.critic_max_grad_norm, "reward_loss")
+                gradient_step(loss, [policy.reward_optimizer], self.max_grad_norm, "reward_loss")
                 losses["reward_loss"] = loss
 
             if self._n_updates % self.policy_delay == 0:
@@ -255,7 +255,7 @@ class CHDP(ExploringAlgorithm):
                 parameters = self._parameters_of_latents(replay_data)
                 diffusion_loss, q_loss = discrete_policy_loss(policy, replay_data, features, parameters)
                 loss = diffusion_loss + alpha * q_loss
-                gradient_step(loss, [policy.discrete_optimizer], self.policy_max_grad_norm, "discrete_loss")
+                gradient_step(loss, [policy.discrete_optimizer], self.max_grad_norm, "discrete_loss")
                 losses |= {"discrete_loss": loss, "diffusion_loss_discrete": diffusion_loss}
 
                 # Step 2: continuous policy and codebook, eq. 8, given the updated discrete policy
@@ -263,7 +263,7 @@ class CHDP(ExploringAlgorithm):
                 diffusion_loss, q_loss = continuous_policy_loss(policy, replay_data, features, latents, k)
                 loss = diffusion_loss + alpha * q_loss
                 optimizers = [policy.continuous_optimizer, policy.codebook_optimizer]
-                gradient_step(loss, optimizers, self.policy_max_grad_norm, "continuous_loss")
+                gradient_step(loss, optimizers, self.max_grad_norm, "continuous_loss")
                 policy.actor.codebook.project()
                 losses |= {"continuous_loss": loss, "diffusion_loss_continuous": diffusion_loss}
 
