@@ -210,7 +210,7 @@ class _Player:
                 obs, length = self.reset(), 0
 
     def _random_row(self, rng: np.random.Generator) -> np.ndarray:
-        return self.spec.sample_rows(rng, 1, allowed_now(self.env, self.spec))[0]
+        return self.spec.sample_rows(rng, 1, _call("action_masks()", allowed_now, self.env, self.spec))[0]
 
     def oddities(self) -> list[str]:
         """:return: what is legal but most likely not meant, in the episodes played"""

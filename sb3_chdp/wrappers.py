@@ -11,7 +11,7 @@ from sb3_chdp.common.hybrid_box import ScoreBox
 from sb3_chdp.common.masks import allowed_now
 
 
-class FlattenHybridAction(gym.ActionWrapper[np.ndarray, np.ndarray, Any]):
+class FlattenHybridAction(gym.ActionWrapper[np.ndarray, np.ndarray, Any], gym.utils.RecordConstructorArgs):
     """
     Let SB3's own algorithms (SAC, TD3, PPO, ...) run on an environment with hybrid actions.
 
@@ -24,7 +24,8 @@ class FlattenHybridAction(gym.ActionWrapper[np.ndarray, np.ndarray, Any]):
     """
 
     def __init__(self, env: gym.Env, action_layout: str = "auto"):
-        super().__init__(env)
+        gym.utils.RecordConstructorArgs.__init__(self, action_layout=action_layout)
+        gym.ActionWrapper.__init__(self, env)
         self.score_space = ScoreBox(env.action_space, action_layout)
         self.action_space = self.score_space
 
@@ -32,8 +33,11 @@ class FlattenHybridAction(gym.ActionWrapper[np.ndarray, np.ndarray, Any]):
         """
         :param action: (K + P,) scores and parameters
         :return: the native action
+        :raises ValueError: for another shape, NaN or infinity
         """
         row = np.asarray(action)[None]
+        if row.shape[1:] != self.action_space.shape or not np.isfinite(row).all():
+            raise ValueError(f"action must be finite and of shape {self.action_space.shape}, got {action}")
         masks = allowed_now(self.env, self.score_space.spec)
         if masks is not None:
             row = self.score_space.mask_scores(th.as_tensor(row), th.as_tensor(masks)).numpy()
@@ -44,13 +48,19 @@ class FlattenHybridAction(gym.ActionWrapper[np.ndarray, np.ndarray, Any]):
         return self.env.get_wrapper_attr("compute_reward")(*args)
 
 
-class ScalarBoxes(gym.ActionWrapper[Any, Any, Any]):
+class ScalarBoxes(gym.ActionWrapper[Any, Any, Any], gym.utils.RecordConstructorArgs):
     """
     For environments whose ``step`` wants a number where their action space says ``Box`` of one element.
 
     The action space stays as it is. On the way to the environment, every array of a box with one element becomes a
     Python number, also inside ``Tuple``, ``Dict`` and ``OneOf``.
+
+    :param env: environment with a hybrid action space
     """
+
+    def __init__(self, env: gym.Env):
+        gym.utils.RecordConstructorArgs.__init__(self)
+        gym.ActionWrapper.__init__(self, env)
 
     def action(self, action: Any) -> Any:
         """

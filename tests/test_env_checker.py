@@ -9,8 +9,8 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_chdp import CHDP, ScalarBoxes, check_hybrid_env
-from tests.hybrid_envs import LayoutEnv, MaskedEnv, box, layouts
+from sb3_chdp import CHDP, FlattenHybridAction, ScalarBoxes, check_hybrid_env
+from tests.hybrid_envs import LayoutEnv, MaskedEnv, box, layouts, make_layout_env
 
 ACTIONS: Any = layouts()["shared"]
 PLANE = box(-1, 1, 2)
@@ -109,6 +109,8 @@ ERRORS = {
         "gymnasium.wrappers.FlattenObservation(env)",
     ),
     "tuple_observation": (lambda: observing(spaces.Tuple((PLANE, PLANE))), "observation_space is a Tuple, but"),
+    "broken_masks": (lambda: walk(action_masks=lambda self: 1 / 0), "action_masks() failed with ZeroDivisionError: division"),
+    "no_elements": (lambda: observing(box(-1, 1, 0)), "which has no elements: leave it out"),
     "observation_from_one": (lambda: observing(spaces.Discrete(4, start=1)), "observation_space is Discrete(4, start=1), but"),
     "sequence_observation": (
         lambda: observing(spaces.Sequence(PLANE)),
@@ -263,6 +265,21 @@ def test_scalar_boxes(layout):
         action = env.action_space.sample()
         env.step(action)
         assert plain(recording.action) == unpacked(plain(action))
+
+
+@pytest.mark.parametrize("wrapper", [FlattenHybridAction, ScalarBoxes])
+def test_wrappers_are_made_again_from_their_spec(wrapper):
+    env = wrapper(gym.make("HardMove4-v0"))
+    assert isinstance(gym.make(env.spec), wrapper)
+
+
+def test_flat_actions_are_checked():
+    env: Any = FlattenHybridAction(make_layout_env())
+    env.reset()
+    n = len(env.action_space.sample())
+    for action in (np.zeros(n + 1), np.full(n, np.nan)):
+        with pytest.raises(ValueError, match="action must be finite and of shape"):
+            env.step(action)
 
 
 def test_training_through_scalar_boxes():

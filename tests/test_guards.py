@@ -126,6 +126,29 @@ def test_the_very_first_observation(algorithm):
     assert is_finite(model)
 
 
+def test_after_an_error_the_environment_is_reset(algorithm):
+    """It has gone on: a step from what was seen before the error would never have happened."""
+    env = BrokenEnv("reward", np.nan)
+    model = make_model(algorithm, env)
+    with pytest.raises(ValueError, match="The reward must be finite"):
+        model.learn(60)
+    n_resets = env.n_resets
+    model.learn(2, reset_num_timesteps=False)
+    assert env.n_resets > n_resets
+
+
+class MoreThanTheSpace(LayoutEnv):
+    """Its observations have an entry that its space does not have."""
+
+    def step(self, action):
+        obs, *rest = super().step(action)
+        return {**obs, "more": np.zeros(3)}, *rest
+
+
+def test_entries_of_observations_that_are_not_in_the_space(algorithm):
+    make_model(algorithm, MoreThanTheSpace(layouts()["shared"], DICT, episode_length=10), "MultiInputPolicy").learn(30)
+
+
 @pytest.mark.parametrize("reward", [3e38, 1e20], ids=str)
 def test_rewards_that_normalization_hides(algorithm, reward):
     env = VecNormalize(DummyVecEnv([lambda: BrokenEnv("reward", reward)]))

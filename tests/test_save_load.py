@@ -3,6 +3,7 @@
 import io
 import warnings
 import zipfile
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -61,6 +62,15 @@ def test_set_parameters_and_policy_save(algorithm, tmp_path):
     same_predictions(model, other)
     model.policy.save(tmp_path / "policy")
     same_predictions(model.policy, type(model.policy).load(tmp_path / "policy"))
+
+
+def test_copies_and_files_in_memory(algorithm):
+    model = make_model(algorithm, make_layout_env()).learn(30)
+    same_predictions(model, deepcopy(model))
+    for part in (model, model.policy):
+        file = io.BytesIO()
+        part.save(file)
+        same_predictions(model, type(part).load(file))
 
 
 def test_replay_buffer(off_policy_algorithm, tmp_path):

@@ -196,6 +196,33 @@ def test_row_out_of_range():
         HybridActionSpec(layouts()["shared"]).to_native([3, 0, 0])
 
 
+def test_rows_that_are_no_actions():
+    spec = HybridActionSpec(layouts()["shared"])
+    with pytest.raises(ValueError, match=r"3 numbers or more, got shape \(2,\)"):
+        spec.to_native([1, 0])
+    with pytest.raises(ValueError, match="must be finite"):
+        spec.to_native([1, 0, np.nan])
+    # What lies behind the parameters does not matter
+    spec.to_native([1, 0, 0, np.nan])
+
+
+def zero(action):
+    """Set all arrays of a native action to 0, as an environment that clips in place would change them."""
+    for part in action.values() if isinstance(action, dict) else action if isinstance(action, tuple) else ():
+        zero(part)
+    if isinstance(action, np.ndarray):
+        action[...] = 0
+
+
+@pytest.mark.parametrize("layout", layouts())
+def test_native_actions_may_be_changed(layout):
+    spec = HybridActionSpec(layouts()[layout])
+    row = spec.sample_rows(np.random.default_rng(0), 1)[0]
+    first, second = spec.to_native(row), spec.to_native(row)
+    zero(first)
+    np.testing.assert_equal(spec.to_native(row), second)
+
+
 @pytest.mark.parametrize("layout", layouts())
 def test_native_actions_are_of_the_types_of_the_space(layout):
     """Plain tuples and dicts, which subprocesses can unpickle without this package."""

@@ -191,6 +191,9 @@ class HybridAlgorithm(BaseAlgorithm):
                 f" at step {self.num_timesteps}, after {self._n_updates} updates. The model is as it was before, {where}. "
                 "What helps: a smaller learning_rate, smaller rewards or observations",
             ) from error
+        except Exception:
+            self._last_obs = None  # the environment may have gone on, or begun anew: learning begins with a reset again
+            raise
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         # What a function gives is known only now

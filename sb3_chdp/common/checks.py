@@ -50,6 +50,8 @@ def check_observation_space(space: spaces.Space[Any]) -> None:
     parts = {f"observation_space[{key!r}]": part for key, part in space.items()} if isinstance(space, spaces.Dict) else None
     for name, part in (parts or {"observation_space": space}).items():
         is_flat = isinstance(part, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary))
+        if isinstance(part, spaces.Box) and 0 in part.shape:
+            raise ValueError(f"{name} is {part}, which has no elements: leave it out")
         starts_elsewhere = np.any(getattr(part, "start", 0))
         if is_flat and not starts_elsewhere and not (isinstance(part, spaces.MultiDiscrete) and len(part.shape) > 1):
             continue

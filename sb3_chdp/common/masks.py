@@ -26,7 +26,7 @@ def read_masks(spec: HybridActionSpec, masks: Any, n: int, first: int = 0) -> np
     :raises ValueError: for another shape, or if nothing is allowed in an environment; the message names it
     """
     given = np.asarray(masks, dtype=bool)
-    array = given.reshape(-1, given.shape[-1]) if given.ndim else given
+    array = given.reshape(-1, given.shape[-1]) if given.size and given.ndim else given
     accepted = sorted({spec.n_mask_values, sum(spec.radices)})
     if array.ndim != 2 or len(array) != n or array.shape[1] not in accepted:
         lengths = " or ".join(map(str, accepted))

@@ -48,6 +48,10 @@ class NativeActionVecEnv(VecEnvWrapper):
         self.rows = rows
         self._normalize = unwrap_vec_normalize(venv)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # What VecEnvWrapper knows about its class cannot be pickled, and models are copied with all that they have
+        return type(self), (self.venv, self.rows)
+
     def reset(self) -> VecEnvObs:
         return self.venv.reset()
 
@@ -64,7 +68,8 @@ class NativeActionVecEnv(VecEnvWrapper):
             if self._normalize is not None:
                 check_numbers("The reward before normalization", self._normalize.old_reward)
             for i in np.flatnonzero(dones).tolist():
-                self._check_terminal(i, infos[i].get("terminal_observation"))
+                if "terminal_observation" in infos[i]:
+                    infos[i]["terminal_observation"] = self._checked_terminal(i, infos[i]["terminal_observation"])
         # SubprocVecEnv hands on whole numbers as such, to which no value can be added
         return obs, np.asarray(rewards, dtype=np.float32), dones, infos
 
@@ -77,13 +82,18 @@ class NativeActionVecEnv(VecEnvWrapper):
         if self._normalize is not None:
             check_numbers("The observation before normalization", self._normalize.old_obs)
 
-    def _check_terminal(self, index: int, obs: Any) -> None:
-        """Check the last observation of an episode, which goes into the replay buffer or is valued for bootstrapping."""
+    def _checked_terminal(self, index: int, obs: Any) -> Any:
+        """
+        :return: the last observation of an episode, which goes into the replay buffer or is valued for bootstrapping; without
+            entries that are not in the space, as the other observations
+        """
         space = self.observation_space
-        parts = {} if obs is None else obs if isinstance(obs, dict) else {"": obs}
-        for key, part in parts.items():
+        if isinstance(space, spaces.Dict):
+            obs = {key: obs[key] for key in space}
+        for key, part in obs.items() if isinstance(obs, dict) else [("", obs)]:
             name = f"The terminal observation[{key!r}]" if key else "The terminal observation"
             expected = (space[key] if isinstance(space, spaces.Dict) else space).shape
             if np.shape(part) != expected:
                 raise ValueError(f"{name} must have shape {expected}, got {np.shape(part)} from environment {index}")
             check_numbers(name, np.asarray(part)[None], index)
+        return obs

@@ -9,6 +9,7 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
 
+from sb3_chdp.common.arguments import check_device
 from sb3_chdp.common.checks import LARGEST, check_numbers
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.masks import read_masks
@@ -90,8 +91,9 @@ class HybridPolicy(BasePolicy):
         obs_tensor, vectorized_env = self.obs_to_tensor(observation)
         tensors = obs_tensor if isinstance(obs_tensor, dict) else {"": obs_tensor}
         if not all(bool((tensor.abs() <= LARGEST).all()) for tensor in tensors.values() if tensor.is_floating_point()):
-            parts = observation if isinstance(observation, dict) else {"observation": np.asarray(observation)}
-            for name, part in parts.items():
+            parts = observation if isinstance(observation, dict) else {"": np.asarray(observation)}
+            for key, part in parts.items():
+                name = f"observation[{key!r}]" if key else "observation"
                 check_numbers(name, np.asarray(part) if vectorized_env else np.asarray(part)[None])
         masks = self.mask_arguments(action_masks, len(next(iter(tensors.values()))))
         with th.no_grad():
@@ -123,6 +125,7 @@ class HybridPolicy(BasePolicy):
         :return: the policy
         :raises ValueError: if the file is of another class or version, or if it is pickled and not trusted
         """
+        check_device(device)
         start = path.tell() if isinstance(path, io.IOBase) else 0
         policy = load_policy(cls, path, device)
         if policy is None:

@@ -88,7 +88,12 @@ def read_bytes(path: PathOrFile) -> tuple[io.BytesIO, Any]:
     """:return: the file, read once so that it cannot change while it is checked, and what messages call it"""
     file = open_path(path, "r", suffix="zip")
     try:
-        return io.BytesIO(file.read()), path if is_path(path) else "The file"
+        content = file.read()
+        if not content and file.seekable():
+            # Just written; SB3 reads from the beginning, too
+            file.seek(0)
+            content = file.read()
+        return io.BytesIO(content), path if is_path(path) else "The file"
     finally:
         if is_path(path):
             file.close()

@@ -172,7 +172,6 @@ def template_action(space: spaces.Space[Any]) -> Any:
         if key not in cache:
             middle = 0.5 * part.low.astype(np.float64) + 0.5 * part.high.astype(np.float64)
             cache[key] = cast_to_box(middle, part)
-            cache[key].setflags(write=False)
         return cache[key]
 
     return build(space)

@@ -1,5 +1,6 @@
 """Hybrid action spaces: the only module, with ``space_tree``, that knows how users spell them."""
 
+import pickle
 from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
@@ -105,10 +106,12 @@ class HybridActionSpec:
         if isinstance(space, spaces.OneOf):
             self._boxes = [collect_boxes(part, path, f"action_space.spaces[{i}]") for i, (path, part) in enumerate(options)]
             # The part of the native action behind the index lives under the key "option" while it is being built
-            self._templates: list[Any] = [{"option": template_action(option)} for option in space.spaces]
+            templates: list[Any] = [{"option": template_action(option)} for option in space.spaces]
         else:
             self._boxes = [collect_boxes(part, path) for path, part in options]
-            self._templates = [template_action(space)]
+            templates = [template_action(space)]
+        # Pickled: to load one is the fastest way to copy it, and every action has arrays of its own, which may be changed
+        self._templates = [pickle.dumps(template) for template in templates]
         self._build_tables()
 
     def _build_tables(self) -> None:
@@ -189,8 +192,14 @@ class HybridActionSpec:
         """
         :param rows: (n, 1 + Pmax) or wider, ``[k | scaled parameters | ignored]``
         :return: n native actions
+        :raises ValueError: if rows are too narrow, have no such discrete action or are not finite
         """
         rows = np.asarray(rows)
+        width = self.columns.width
+        if rows.ndim != 2 or rows.shape[1] < width:
+            raise ValueError(f"A row must be {width} numbers or more, got shape {rows.shape[1:]}")
+        if not np.isfinite(rows[:, :width]).all():
+            raise ValueError(f"The first {width} numbers of a row must be finite, got {rows[:, :width]}")
         choices = self.columns.discrete_actions(rows)
         largest = np.array(self.radices) - 1
         if ((choices < 0) | (choices > (largest if self.is_factored else largest[0]))).any():
@@ -203,7 +212,7 @@ class HybridActionSpec:
 
     def _assemble(self, k: Any, values: np.ndarray) -> Any:
         option = 0 if self.is_shared else int(k)
-        native = self._templates[option if isinstance(self.space, spaces.OneOf) else 0]
+        native = pickle.loads(self._templates[option if isinstance(self.space, spaces.OneOf) else 0])
         for box in self._boxes[option]:
             native = replace_part(native, box.path, cast_to_box(values[box.columns], box.space))
         if isinstance(self.space, spaces.OneOf):
