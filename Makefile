@@ -5,11 +5,12 @@ SHELL := bash
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -q
 SOURCES := sb3_chdp tests benchmarks docs examples
 # Small networks are fastest on one thread
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: train test notebooks format lint type check-codestyle docs package hooks speed clean-env
+.PHONY: train test test-all notebooks format lint type check-codestyle docs package hooks speed clean-env
 
 $(STAMP): setup.cfg pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
@@ -22,7 +23,10 @@ train: $(STAMP)
 	$(BIN)/sb3-chdp enjoy --env Platform-v0 --folder logs --no-render --n-timesteps 1000 | grep --invert-match "^Episode "
 
 test: $(STAMP)
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -q tests
+	$(PYTEST) -m "not slow" tests
+
+test-all: $(STAMP)
+	$(PYTEST) tests
 
 notebooks: $(STAMP)
 	$(BIN)/python -m pytest -n 2 -q --nbmake notebooks

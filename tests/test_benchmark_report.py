@@ -79,6 +79,7 @@ def test_probability_of_improvement():
     assert probability_of_improvement([1.0, 2.0], [3.0, 4.0])[0] == 0
 
 
+@pytest.mark.slow
 def test_seven_algorithms_and_nine_environments(tmp_path):
     results = make_results(GRID)
     scores = scores_of(results)

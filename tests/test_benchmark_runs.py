@@ -59,7 +59,7 @@ def without_seconds(rows):
     return [str({key: value for key, value in row.items() if key != "seconds"}) for row in rows]
 
 
-@pytest.mark.parametrize("algo", TINY)
+@pytest.mark.parametrize("algo", [algo if algo == "hppo" else pytest.param(algo, marks=pytest.mark.slow) for algo in TINY])
 def test_a_killed_run_goes_on_to_the_last_bit(algo, tmp_path):
     # Long enough to be killed halfway
     n_timesteps = 2400 if algo == "hppo" else 960
@@ -230,6 +230,7 @@ def holder(run):
     return int(path.read_text().split()[1])
 
 
+@pytest.mark.slow
 def test_a_killed_worker_is_reported_and_the_others_go_on(tmp_path):
     options = ["--algos", "hppo", "--seeds", "0", "1", "--jobs", "2", "--steps", "4000", "-params", "n_envs:4", "n_steps:10"]
     process = benchmark(tmp_path, *options)
@@ -241,6 +242,7 @@ def test_a_killed_worker_is_reported_and_the_others_go_on(tmp_path):
     assert [run.is_complete for run in runs] == [False, True]
 
 
+@pytest.mark.slow
 def test_workers_end_with_their_parent(tmp_path):
     options = ["--algos", "hppo", "--seeds", "0", "--steps", "100000", "-params", "n_envs:4", "n_steps:10"]
     process = benchmark(tmp_path, *options)

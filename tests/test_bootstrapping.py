@@ -32,13 +32,18 @@ def final_reward(algorithm, gamma, seed=0):
     return evaluate_policy(model, make_vec_env(HybridChainEnv, 1), 1)[0]
 
 
-@pytest.mark.parametrize("algorithm", SETTINGS, ids=lambda algorithm: algorithm.__name__)
+@pytest.mark.parametrize(
+    "algorithm",
+    [pytest.param(algorithm, marks=pytest.mark.slow) if algorithm is HyARTD3 else algorithm for algorithm in SETTINGS],
+    ids=lambda algorithm: algorithm.__name__,
+)
 def test_all_decisions_are_learnt(algorithm):
     # HyAR-TD3 learns the chain with some seeds only
     assert any(final_reward(algorithm, gamma=0.9, seed=seed) > 0.8 for seed in range(4 if algorithm is HyARTD3 else 1))
 
 
 # HyAR-TD3 takes long, and this says something about the chain rather than about algorithms
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "algorithm", [algorithm for algorithm in SETTINGS if algorithm is not HyARTD3], ids=lambda algorithm: algorithm.__name__
 )

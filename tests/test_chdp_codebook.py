@@ -70,6 +70,7 @@ def test_critics_bring_codewords_of_similar_actions_together():
     assert distance_of_groups(CHDP) > 2 * distance_of_groups(WithoutCritics)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reward", [0.0, 12345.678])
 def test_codewords_stay_apart_where_all_actions_are_worth_the_same(reward):
     """Every action can still be chosen, though nothing tells the critics that they differ."""

@@ -26,6 +26,7 @@ def n_pictures(folder):
     return sum(1 for _ in imageio.get_reader(video))
 
 
+@pytest.mark.slow
 def test_an_id_with_a_slash(tmp_path):
     run("train", "--env", ENV_ID, "-n", "120", "--eval-freq", "-1", *TINY, cwd=tmp_path)
     logs = tmp_path / "logs" / "chdp" / f"{FOLDER}_1"

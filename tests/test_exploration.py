@@ -91,6 +91,7 @@ def test_rounding_is_no_difference():
     assert returns.informative_share() == 0.0
 
 
+@pytest.mark.slow
 def test_many_environments_explore_until_something_is_learnt():
     """Their steps are many before the first gradient steps."""
     rates = {}

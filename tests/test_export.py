@@ -84,12 +84,14 @@ def test_every_algorithm(name, tmp_path):
     check(getattr(sb3_chdp, name)("MlpPolicy", make_layout_env("flat"), seed=1), tmp_path)
 
 
+@pytest.mark.slow
 def test_rewards_that_count_for_more(tmp_path):
     model = sb3_chdp.CHDP("MlpPolicy", make_layout_env("flat"), seed=1)
     model.policy.set_foresight(0.5)
     check(model, tmp_path, n=50)
 
 
+@pytest.mark.slow
 def test_a_trained_model(tmp_path):
     """Where a decision differs, the critics hold another candidate for as good, to the rounding of their values."""
     model = sb3_chdp.CHDP.load(MODEL, device="cpu")

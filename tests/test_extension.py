@@ -49,6 +49,7 @@ def check_report(folder, *names):
         assert (folder / f"{picture}.png").read_bytes().startswith(PNG)
 
 
+@pytest.mark.slow
 def test_new_algorithm(tmp_path):
     """In a copy of the package, with the folder and the line of the guide."""
     for part in ("sb3_chdp", "tests"):
@@ -68,6 +69,7 @@ def test_new_algorithm(tmp_path):
     assert re.search(r"[1-9]\d* passed", run_in_copy(tests, tmp_path))
 
 
+@pytest.mark.slow
 def test_new_env(tmp_path):
     """In a folder of its own, with the file of the guide; the environment reports no success."""
     (code,) = blocks("new_env.md", "python")

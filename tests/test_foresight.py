@@ -116,6 +116,7 @@ class Pairs(gym.Env):
         return self._observe(int(action[0])), reward, False, self.n_steps == 20, {}
 
 
+@pytest.mark.slow
 def test_claims_come_true_where_actions_have_influence():
     sums = []
     for random in (True, False):

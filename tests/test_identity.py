@@ -48,6 +48,7 @@ def test_hybrid_identity(algorithm):
     assert success(model) > THRESHOLD
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("broken", ["critics ignore the latents", "no policy improvement"])
 def test_broken_chdp_fails(broken):
     """The threshold is out of reach without the parts that make the algorithm learn."""
@@ -63,6 +64,7 @@ def test_broken_chdp_fails(broken):
     assert success(model) < THRESHOLD - 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("baseline", BASELINES, ids=lambda baseline: baseline.__name__)
 def test_broken_baselines_fail(baseline):
     """A critic that does not learn leads nowhere."""

@@ -203,6 +203,7 @@ def test_hppo_learns_faster_from_masks_than_from_a_penalty():
     assert returns[False] < returns[True] - 0.2
 
 
+@pytest.mark.slow
 def test_chdp_learns_faster_from_masks_than_from_a_penalty():
     returns = {}
     for with_masks in (True, False):

@@ -12,6 +12,7 @@ NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 BUDGET = re.compile(r"(?<=\.learn\()[\d_]+(?=\))|(?<=--steps )\d+")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)
 def test_cells_run(path, tmp_path):
     notebook = nbformat.read(path, as_version=4)

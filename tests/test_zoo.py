@@ -139,6 +139,7 @@ def test_every_algorithm(algo, tmp_path):
     assert can_be_tuned or output.strip() == f"sb3-chdp optimize: {algo} has no Optuna sampler and cannot be tuned"
 
 
+@pytest.mark.slow
 def test_two_processes_tune_one_study(tmp_path):
     """What several machines do, with the journal on a file system that they share."""
     study = ["--storage", "study.log", "--study-name", "both", "--no-optim-plots", "--n-evaluations", "1"]
