@@ -82,7 +82,7 @@ def compare(env: gym.Env, rule: Callable[[gym.Env], Any], n_timesteps: int, name
         trials.append((before, mean_return(env, policy, args.episodes)))
     returns["before training"], returns["after training"] = np.mean(trials, axis=0)
     for what, value in returns.items():
-        print(f"{what:16} {value:.1f}")
+        print(f"{what:16} {value:,.1f}")
     if args.write:
         settings = f"{ALGORITHMS[args.algo].display_name} | {args.steps:,} | {len(args.seeds)}"
-        write_row(PAGE, name, f"{settings} | {' | '.join(f'{value:.1f}' for value in returns.values())}")
+        write_row(PAGE, name, f"{settings} | {' | '.join(f'{value:,.1f}' for value in returns.values())}")

@@ -42,7 +42,7 @@ def test_a_few_steps(name, tmp_path):
     done = subprocess.run(command, cwd=tmp_path, env=environment, text=True, capture_output=True)
     assert done.returncode == 0, done.stderr
     printed = dict(re.findall(r"^(\D+?) +(\S+)$", done.stdout, flags=re.MULTILINE))
-    assert all(np.isfinite(float(printed[what])) for what in RETURNS)
+    assert all(np.isfinite(float(printed[what].replace(",", ""))) for what in RETURNS)
 
 
 def test_the_table_is_filled_row_by_row(tmp_path):
