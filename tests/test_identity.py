@@ -48,7 +48,6 @@ def test_hybrid_identity(algorithm):
     assert success(model) > THRESHOLD
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("broken", ["critics ignore the latents", "no policy improvement"])
 def test_broken_chdp_fails(broken):
     """The threshold is out of reach without the parts that make the algorithm learn."""
