@@ -108,10 +108,6 @@ class WithoutCodebook(CHDP):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": OneHotPolicy}
     takes_factored = False
 
-    def _make_hybrid_space(self, action_layout: str) -> HybridBox:
-        n_discrete_actions = HybridActionSpec(self.action_space, action_layout).n_discrete_actions
-        return HybridBox(self.action_space, action_layout, n_discrete_actions, self._mask_parts())
-
 
 class WithoutSequentialUpdate(CHDP):
     """The continuous policy is improved for the stored actions, whatever the discrete policy does."""
@@ -149,6 +145,10 @@ class PaperWithoutCodebook(WithoutCodebook, PaperCHDP):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": PaperOneHotPolicy}
 
+    def _make_hybrid_space(self, action_layout: str) -> HybridBox:
+        n_discrete_actions = HybridActionSpec(self.action_space, action_layout).n_discrete_actions
+        return HybridBox(self.action_space, action_layout, n_discrete_actions, self._mask_parts())
+
 
 class PaperWithoutSequentialUpdate(WithoutSequentialUpdate, PaperCHDP):
     """:class:`WithoutSequentialUpdate` of the published algorithm."""
@@ -156,10 +156,8 @@ class PaperWithoutSequentialUpdate(WithoutSequentialUpdate, PaperCHDP):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = PaperCHDP.policy_aliases
 
 
-class PaperWithoutBoth(WithoutBoth, PaperCHDP):
+class PaperWithoutBoth(WithoutBoth, PaperWithoutCodebook):
     """:class:`WithoutBoth` of the published algorithm."""
-
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": PaperOneHotPolicy}
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_chdp import ALGORITHMS as REGISTRY
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import PaperCHDP
-from sb3_chdp.common.samples import name_columns
 from tests.hybrid_envs import HybridIdentityEnv, layouts
 
 OFF_POLICY = dict(batch_size=8, learning_starts=12, buffer_size=500)
@@ -66,7 +65,7 @@ def filled_model(env=None, algorithm_class=CHDP, n_transitions=60, **kwargs):
 
 def sample(model, batch_size=32):
     """:return: a batch of the model's replay buffer"""
-    return name_columns(model.replay_buffer.sample(batch_size), model.hybrid_space, model.gamma)
+    return model._sample_batch(batch_size)
 
 
 def calls_of(module):

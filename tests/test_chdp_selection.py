@@ -98,6 +98,17 @@ def test_every_discrete_action_competes_where_there_are_few(actor):
         assert (Selection(1, N_ACTIONS)(actor, critic, random_features(actor, 50)).discrete_actions == wanted).all()
 
 
+def test_sampled_values_try_what_the_critics_disagree_about(actor):
+    """Of three actions one is worth 0, one 1 or -1, the critics do not know, and one -2."""
+    of_actions = th.tensor([[0.0, 0.0], [1.0, -1.0], [-2.0, -2.0]])
+    q1, q2 = (lambda _, latents, parameters, i=i: of_actions[actor.codebook.quantize(latents), i, None] for i in range(2))
+    for sampled in (False, True):
+        select, features = Selection(1, N_ACTIONS, sampled=sampled), random_features(actor, 200)
+        k = select(actor, Critic(q1, q2), features).discrete_actions
+        share = (k == 1).float().mean()
+        assert (k <= 1).all() and (0.3 < share < 0.8 if sampled else share == 0)
+
+
 def test_fewer_uniform_actions_than_there_are(actor):
     """Each observation gets some at random, all of them equally often."""
     critic = Critic(near(0.0))
@@ -198,13 +209,20 @@ def test_predictions_are_the_best_candidates(deterministic):
     for network, values in zip(q_networks, outputs, strict=True):
         network.register_forward_hook(lambda module, args, q, values=values: values.append(q.detach()))
     rows = model.policy.predict_rows(obs, deterministic)
-    best = th.min(outputs[0][0], outputs[1][0]).view(6, -1).argmax(dim=1)
-    # Deterministic ones are refined: what the parameters are near to
-    for name, asked, tolerance in zip(("latents", "parameters"), calls[0][1:], (0, 0.5 if deterministic else 0), strict=True):
-        expected = asked.view(6, -1, asked.shape[1])[th.arange(6), best]
-        np.testing.assert_allclose(columns.view(rows, name), expected, atol=tolerance)
-    latents = th.as_tensor(columns.view(rows, "latents"))
-    assert (model.actor.codebook.quantize(latents).numpy() == columns.discrete_actions(rows)).all()
+    q1, q2 = (values[0].view(6, -1) for values in outputs)
+    latents, parameters = (asked.view(6, -1, asked.shape[1]) for asked in calls[0][1:])
+    k = model.actor.codebook.quantize(latents.flatten(0, 1)).view(6, -1).numpy()
+    acted, acted_k = columns.view(rows, "parameters"), columns.discrete_actions(rows)
+    if deterministic:
+        best = th.min(q1, q2).argmax(dim=1)
+        # They are refined: what the parameters are near to
+        np.testing.assert_allclose(acted, parameters[th.arange(6), best], atol=0.5)
+        assert (k[np.arange(6), best] == acted_k).all()
+    else:
+        # Which is best depends on draws between both critics
+        may_be_best = th.max(q1, q2) >= th.min(q1, q2).amax(dim=1, keepdim=True)
+        is_acted = (parameters.numpy() == acted[:, None]).all(axis=2) & (k == acted_k[:, None])
+        assert (is_acted & may_be_best.numpy()).any(axis=1).all()
     assert len(calls[0][0]) >= 6 * (model.n_action_candidates + N_ACTIONS)
 
 

@@ -207,12 +207,10 @@ def test_each_part_is_varied():
     assert set(varied[:, 0]) == {0, 1, 2}
     assert np.abs(varied[:, 1:]).max() <= 1
     assert not columns.view(varied, "parameters")[~spec.mask[varied[:, 0].astype(int)].astype(bool)].any()
-    decoded = model.actor.codebook.quantize(th.as_tensor(columns.view(varied, "latents")))
-    assert (decoded.numpy() == varied[:, 0]).mean() > 0.97
 
-    kept = (columns.view(varied, "latents") == columns.view(rows, "latents")).all(axis=1)
-    assert kept.mean() == pytest.approx(0.5, abs=0.05)
-    assert (varied[kept, 0] == rows[kept, 0]).all()
+    # One of three uniformly random discrete actions is the same by chance
+    kept = varied[:, 0] == rows[:, 0]
+    assert kept.mean() == pytest.approx(0.5 + 0.5 / 3, abs=0.05)
     two_parameters = kept & (rows[:, 0] == 0)
     near = np.abs(columns.view(varied - rows, "parameters"))[two_parameters].max(axis=1) < 0.1
     assert 0.1 < near.mean() < 0.4

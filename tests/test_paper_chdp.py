@@ -28,7 +28,6 @@ def test_stored_latents_stay(model):
     model.train(1, 32)
     stored = th.as_tensor(model.hybrid_space.columns.view(model.replay_buffer.actions[:60, 0], "latents"))
     assert (calls[0][1][:, None] == stored).all(dim=2).any(dim=1).all()
-    assert 0 < model.logger.name_to_value["train/latent_drift"] <= 1
 
 
 def test_latents_are_valued_with_the_stored_parameters(model):

@@ -114,17 +114,6 @@ def test_an_action_is_allowed_if_all_of_its_values_are():
     assert expected.any() and not expected.all() and th.equal(codebook.allowed(k, masks), expected)
 
 
-def test_entries_stray_with_their_choice():
-    codebook, k = ProductCodebook(RADICES, 3), random_values(RADICES, (40,))
-    latents = codebook.representative_latents(k)
-    assert not codebook.strayed(latents, k).any()
-    other = k.clone()
-    other[:, 2] = (k[:, 2] + 1) % RADICES[2]
-    start, width = sum(block_widths(RADICES, 3)[:2]), block_widths(RADICES, 3)[2]
-    strayed = codebook.strayed(latents, other)
-    assert strayed[:, start : start + width].all() and strayed.sum() == 40 * width
-
-
 def test_usage_of_every_choice():
     k = th.tensor([[0, 0], [1, 0], [0, 0], [1, 0]])
     usage, perplexity = ProductCodebook((2, 4), 3).usage(k)

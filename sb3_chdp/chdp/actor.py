@@ -63,15 +63,12 @@ class CooperativeActor(nn.Module):
         :param features: (B, features_dim)
         :param noise: noise of the discrete policy's chain, drawn if None
         :param masks: (B, K) False for discrete actions that may not be taken, None if all may
-        :return: latents (B, latent_dim) and the discrete actions (B,) that they decode to; latents of forbidden actions give
-            way to the nearest allowed codeword
+        :return: latents (B, latent_dim) and the discrete actions (B,) that they decode to: codewords, with the gradient of
+            what was drawn (straight-through, van den Oord et al., 2017), so that critics see one latent for one action
         """
-        latents = self.discrete_policy.sample(features, noise=noise)
-        k = self.codebook.quantize(latents, masks)
-        if masks is not None:
-            strayed = self.codebook.strayed(latents, k)
-            latents = th.where(strayed, self.codebook.representative_latents(k), latents)
-        return latents, k
+        drawn = self.discrete_policy.sample(features, noise=noise)
+        k = self.codebook.quantize(drawn, masks)
+        return self.codebook.representative_latents(k) + (drawn - drawn.detach()), k
 
     def condition(self, features: th.Tensor, codewords: th.Tensor) -> th.Tensor:
         """

@@ -64,28 +64,33 @@ class Candidates(NamedTuple):
         batch_size = self.latents.shape[0]
         return Candidates(*(th.cat([a, b.expand(batch_size, *b.shape[1:])], dim=1) for a, b in zip(self, others, strict=True)))
 
-    def values(self, critic: HybridCritic, features: th.Tensor) -> th.Tensor:
+    def values(self, critic: HybridCritic, features: th.Tensor, sampled: bool = False) -> th.Tensor:
         """
         :param critic: twin critic
         :param features: (B, features_dim) features of the observations
-        :return: (B, n) the smaller of both :meth:`HybridCritic.scores`
+        :param sampled: whether to draw values
+        :return: (B, n) the smaller of both :meth:`HybridCritic.scores`, or a uniform draw between the two
         """
         n = self.latents.shape[1]
         inputs = features.repeat_interleave(n, dim=0), self.latents.flatten(0, 1), self.parameters.flatten(0, 1)
-        return th.min(*critic.scores(*inputs)).view(-1, n)
+        q1, q2 = critic.scores(*inputs)
+        return (th.lerp(q1, q2, th.rand_like(q1)) if sampled else th.min(q1, q2)).view(-1, n)
 
-    def best(self, critic: HybridCritic, features: th.Tensor, allowed: th.Tensor | None = None) -> SelectedActions:
+    def best(
+        self, critic: HybridCritic, features: th.Tensor, allowed: th.Tensor | None = None, sampled: bool = False
+    ) -> SelectedActions:
         """
         :param critic: twin critic
         :param features: (B, features_dim) features of the observations
         :param allowed: (B, n) which candidates may be taken, None: all
+        :param sampled: whether to draw values
         :return: the candidates of highest :meth:`values` among those that may be taken
         """
         batch_size, n = self.latents.shape[:2]
         latents, k, parameters = (part.flatten(0, 1) for part in self)
         if n == 1:  # nothing to choose
             return SelectedActions(latents, k, parameters)
-        values = self.values(critic, features)
+        values = self.values(critic, features, sampled)
         if allowed is not None:
             values = values.masked_fill(~allowed, -th.inf)
         best = values.argmax(dim=1) + th.arange(batch_size, device=features.device) * n
@@ -196,6 +201,9 @@ class Selection:
     """
     A rule which actions compete. The one of highest :meth:`Candidates.values` is taken, and refined if ``n_refined`` is not 0.
 
+    With sampled values an action that is rarely taken, which the critics disagree about, now and then looks the best and is
+    tried, as in Thompson sampling.
+
     :param n_drawn: number of actions per observation that both policies draw
     :param n_uniform: number of uniformly random discrete actions with parameters of the continuous policy
     :param n_random: number of uniformly random actions
@@ -203,6 +211,7 @@ class Selection:
         share their parameters
     :param n_refined: number of variations towards which the parameters of the best of all these move, in each of two rounds
         with standard deviations of ``REFINEMENT_SPREADS`` of the scaled parameters; see :func:`refined`
+    :param sampled: whether values are draws between those of both critics, instead of the smaller one
     """
 
     n_drawn: int
@@ -210,6 +219,7 @@ class Selection:
     n_random: int = 0
     n_changed: int = 0
     n_refined: int = 0
+    sampled: bool = False
 
     def __call__(
         self,
@@ -233,10 +243,10 @@ class Selection:
         candidates = drawn_candidates(actor, features, self.n_drawn, self.n_uniform, fixed, masks)
         if self.n_random > 0:
             candidates = candidates.join(random_candidates(actor, features.shape[0], self.n_random, fixed))
-        best = candidates.best(critic, features, allowed(candidates))
+        best = candidates.best(critic, features, allowed(candidates), self.sampled)
         if self.n_changed > 0:
             candidates = changed_candidates(actor, best, self.n_changed, fixed is not None)
-            best = candidates.best(critic, features, allowed(candidates))
+            best = candidates.best(critic, features, allowed(candidates), self.sampled)
         for spread in REFINEMENT_SPREADS if self.n_refined > 0 else ():
             best = refined(actor, critic, features, best, self.n_refined, spread)
         return best

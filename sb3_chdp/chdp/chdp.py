@@ -16,7 +16,6 @@ from sb3_chdp.chdp.losses import (
     continuous_policy_loss,
     critic_loss,
     discrete_policy_loss,
-    relabel_latents,
     reward_loss,
     target_values,
 )
@@ -24,9 +23,7 @@ from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputP
 from sb3_chdp.common.arguments import Accepted, number, of_networks, warn_of_cost, whole
 from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.hybrid_box import HybridBox
-from sb3_chdp.common.product_table import block_widths
 from sb3_chdp.common.samples import HybridReplaySamples
-from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.common.utils import TargetUpdate, gradient_step
 
 # High at first, and 0 in the end: what is learnt settles
@@ -49,9 +46,10 @@ class CHDP(ExploringAlgorithm):
     :class:`PaperCHDP` is the algorithm as published. Differences from it:
         1. observations are normalised, see :class:`NormalizedExtractor`, and values, see :class:`ValueScale`;
         2. critics have layer normalisation, a state value of their own and read parts of the state, see :class:`QNetwork`;
-        3. the critics' loss trains the codebook too, so that actions of similar effect get similar codewords; latents from
-           the buffer that no longer decode to the action taken give way to its present codeword, see ``train/latent_drift``;
-        4. of several actions the one that critics value most acts, and is the next action in targets, see :class:`Selection`;
+        3. the critics' loss trains the codebook too, so that actions of similar effect get similar codewords; these are what
+           critics see of a discrete action, not the latents around them that decode to it, see :class:`CooperativeActor`;
+        4. of several actions the one that critics value most acts, and is the next action in targets; while training, those
+           that they disagree about are tried, see :class:`Selection`;
         5. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
            stored ones, and the continuous policy for uniformly random discrete actions too;
         6. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate`,
@@ -198,9 +196,7 @@ class CHDP(ExploringAlgorithm):
         )
 
     def _make_hybrid_space(self, action_layout: str) -> HybridBox:
-        radices = HybridActionSpec(self.action_space, action_layout).radices
-        width = sum(block_widths(radices, self.latent_dim))
-        return HybridBox(self.action_space, action_layout, width, self._mask_parts())
+        return HybridBox(self.action_space, action_layout, mask_parts=self._mask_parts())
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -226,7 +222,7 @@ class CHDP(ExploringAlgorithm):
         logs: dict[str, list[th.Tensor]] = {}
         for _ in range(gradient_steps):
             self._n_updates += 1
-            replay_data, drift = self._latents_of_today(self._sample_batch(batch_size))
+            replay_data = self._sample_batch(batch_size)
 
             # Step 0: critics, eq. 10 and 11, and the codebook if they train it
             targets = policy.in_units_of_critics(target_values(policy, replay_data))
@@ -238,7 +234,7 @@ class CHDP(ExploringAlgorithm):
             if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
                 assert replay_data.indices is not None, "a prioritised buffer says where its samples are"
                 self.replay_buffer.update_priorities(replay_data.indices, errors)
-            losses = {"critic_loss": loss, "q_mean": policy.value_scale.values(q1).mean(), "latent_drift": drift}
+            losses = {"critic_loss": loss, "q_mean": policy.value_scale.values(q1).mean()}
             features = features.detach()
             # The reward alone, for foresight; PaperCHDP has none
             if policy.reward_optimizer is not None:
@@ -290,9 +286,13 @@ class CHDP(ExploringAlgorithm):
             for leaf, choices in leaves.items() if len(leaves) > 1 else ():
                 self.logger.record(f"train/codebook_{name}/{leaf}", values[choices].mean().item())
 
-    def _latents_of_today(self, replay_data: HybridReplaySamples) -> tuple[HybridReplaySamples, th.Tensor]:
-        """:return: the batch with latents that decode to the stored actions, and the share that did not before"""
-        return relabel_latents(self.policy, replay_data)
+    def _sample_batch(self, batch_size: int) -> HybridReplaySamples:
+        replay_data = super()._sample_batch(batch_size)
+        return replay_data._replace(latents=self._latents(replay_data))
+
+    def _latents(self, replay_data: HybridReplaySamples) -> th.Tensor:
+        """:return: (B, latent_dim) latents of the stored actions: their present codewords"""
+        return self.actor.codebook.representative_latents(replay_data.discrete_actions)
 
     def _parameters_of_latents(self, replay_data: HybridReplaySamples) -> th.Tensor | None:
         """:return: (B, Pmax) parameters with which the discrete policy's latents are valued, None: the continuous policy's"""

@@ -39,14 +39,6 @@ class Codebook(nn.Module):
         """:return: (B, d_e) latents that stand for the discrete actions, their codewords"""
         return self.codewords.detach()[k]
 
-    def strayed(self, latents: th.Tensor, k: th.Tensor) -> th.Tensor:
-        """
-        :param latents: (B, d_e)
-        :param k: (B,) discrete actions
-        :return: (B, 1) which latents do not decode to k
-        """
-        return (self.quantize(latents) != k)[:, None]
-
     def random(self, *shape: int, generator: th.Generator | None = None, masks: th.Tensor | None = None) -> th.Tensor:
         """
         :param shape: how many actions; its first number is B if there are masks

@@ -83,8 +83,8 @@ class ForesightSums(NamedTuple):
 def expected_outcomes(policy: CHDPPolicy, features: th.Tensor, rows: np.ndarray) -> th.Tensor:
     """:return: (n, 2) values and rewards that the target networks expect of actions, in the critics' units"""
     columns, actions = policy.action_space.columns, th.as_tensor(rows, device=policy.device)
-    latents, parameters = columns.view(actions, "latents"), columns.view(actions, "parameters")
-    critic = policy.critic_target
+    latents = policy.acting_actor.codebook.representative_latents(columns.discrete_actions(actions))
+    critic, parameters = policy.critic_target, columns.view(actions, "parameters")
     values = th.stack(critic.q_values(features, latents, parameters)).mean(dim=0)
     assert critic.reward_network is not None, "PaperCHDP does not explore"
     return th.cat([values, critic.reward_network(features, latents, parameters)], dim=1)

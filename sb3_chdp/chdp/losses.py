@@ -1,25 +1,10 @@
-"""The losses of CHDP, most of them an equation of the paper, and the relabelling of stored latents."""
+"""The losses of CHDP, most of them an equation of the paper."""
 
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.samples import HybridReplaySamples
-
-
-def relabel_latents(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> tuple[HybridReplaySamples, th.Tensor]:
-    """
-    Give latents that the codebook has moved away from the present codeword of the stored action.
-
-    :param policy: the networks
-    :param replay_data: a batch
-    :return: the batch, and the share of its latents that did not decode to the stored action
-    """
-    codebook = policy.actor.codebook
-    drifted = codebook.strayed(replay_data.latents, replay_data.discrete_actions)
-    present = codebook.representative_latents(replay_data.discrete_actions)
-    latents = th.where(drifted, present, replay_data.latents)
-    return replay_data._replace(latents=latents), drifted.float().mean()
 
 
 @th.no_grad()
@@ -70,7 +55,7 @@ def critic_loss(
     :param targets: (B, 1) targets y in the units of the critics
     :return: sum over both critics, the detached (B, 1) values of the first, and the larger (B,) absolute error of both
     """
-    # The gradient with respect to a latent is also that of its codeword, as if the one moved with the other
+    # The gradient with respect to a latent is also that of the codeword
     codewords = policy.actor.codebook(replay_data.discrete_actions)
     latents = replay_data.latents + (codewords - codewords.detach())
     q_values = th.cat(policy.critic.q_values(features, latents, replay_data.parameters), dim=1)
@@ -106,10 +91,10 @@ def discrete_policy_loss(
     :return: diffusion loss L_d and policy improvement loss -Q1
     """
     actor = policy.actor
-    latents = actor.discrete_policy.sample(features)
+    latents, k = actor.sample_latents(features, masks=replay_data.masks)
     if parameters is None:
         with th.no_grad():
-            parameters = actor.sample_parameters(features, actor.codebook.quantize(latents, replay_data.masks))
+            parameters = actor.sample_parameters(features, k)
     diffusion_loss = actor.discrete_policy.diffusion_loss(replay_data.latents, features)
     return diffusion_loss, -policy.critic.score1(features, latents, parameters).mean()
 

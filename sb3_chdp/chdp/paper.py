@@ -2,6 +2,7 @@
 
 from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
@@ -9,12 +10,19 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from torch import nn
 
+from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.candidates import Selection
 from sb3_chdp.chdp.chdp import CHDP
 from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.policies import CHDPPolicy
+from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.policies import CnnFeatures, CombinedFeatures
+from sb3_chdp.common.product_table import block_widths
 from sb3_chdp.common.samples import HybridReplaySamples
+from sb3_chdp.common.spaces import HybridActionSpec
+
+# Spread of the latents around a codeword in random actions
+RANDOM_LATENT_NOISE = 0.1
 
 
 class PaperQNetwork(nn.Module):
@@ -35,6 +43,33 @@ class PaperQNetwork(nn.Module):
         return self.mlp(th.cat([features, latents, parameters], dim=1))
 
 
+class PaperActor(CooperativeActor):
+    """
+    :class:`CooperativeActor` whose latents are those that were drawn.
+
+    :param args: those of :class:`CooperativeActor`
+    :param kwargs: those of :class:`CooperativeActor`
+    """
+
+    def sample_latents(
+        self, features: th.Tensor, noise: th.Tensor | None = None, masks: th.Tensor | None = None
+    ) -> tuple[th.Tensor, th.Tensor]:
+        drawn = self.discrete_policy.sample(features, noise=noise)
+        k = self.codebook.quantize(drawn, masks)
+        if masks is None:
+            return drawn, k
+        # Those of forbidden actions give way to the nearest allowed codeword
+        return th.where(self.strayed(drawn, k), self.codebook.representative_latents(k) + (drawn - drawn.detach()), drawn), k
+
+    def strayed(self, latents: th.Tensor, k: th.Tensor) -> th.Tensor:
+        """
+        :param latents: (B, latent_dim)
+        :param k: (B,) discrete actions
+        :return: (B, 1) which latents do not decode to k
+        """
+        return (self.codebook.quantize(latents) != k).view(len(k), -1).any(dim=1, keepdim=True)
+
+
 class PaperPolicy(CHDPPolicy):
     """
     :class:`CHDPPolicy` with plain networks, observations as they are, and one draw per action.
@@ -43,14 +78,15 @@ class PaperPolicy(CHDPPolicy):
     :param kwargs: those of :class:`CHDPPolicy`
     """
 
+    actor_class: ClassVar[type[CooperativeActor]] = PaperActor
     adapts_values: ClassVar[bool] = False
     n_reads: ClassVar[int] = 0
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **{"features_extractor_class": FlattenExtractor, **kwargs})
 
-    def _make_critic(self, extractor: BaseFeaturesExtractor) -> HybridCritic:
-        n_inputs = extractor.features_dim + self.action_space.latent_dim + self.action_space.spec.max_parameters
+    def _make_critic(self, extractor: BaseFeaturesExtractor, latent_dim: int) -> HybridCritic:
+        n_inputs = extractor.features_dim + latent_dim + self.action_space.spec.max_parameters
         critic_arch = get_actor_critic_arch(self.net_arch)[1]
         q_networks: list[nn.Module] = [PaperQNetwork(n_inputs, critic_arch, self.activation_fn) for _ in range(2)]
         return HybridCritic(
@@ -60,6 +96,27 @@ class PaperPolicy(CHDPPolicy):
     def _make_selections(self) -> tuple[Selection, Selection, Selection]:
         one = Selection(n_drawn=1)
         return one, one, one
+
+    def random_rows(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
+        """Uniformly random actions; their latents scatter around the codewords and decode to the actions."""
+        rows, columns = super().random_rows(rng, n, masks), self.action_space.columns
+        k = th.as_tensor(columns.discrete_actions(rows), device=self.device)
+        assert isinstance(self.actor, PaperActor)
+        centres = self.actor.codebook.representative_latents(k)
+        latents = centres.clone()
+        undecided = th.arange(n, device=self.device)
+        spread = RANDOM_LATENT_NOISE
+        for _ in range(5):
+            noise = th.as_tensor(rng.normal(0, spread, (len(undecided), centres.shape[1])), dtype=th.float32)
+            candidates = (centres[undecided] + noise.to(self.device)).clamp(-1, 1)
+            fits = ~self.actor.strayed(candidates, k[undecided])[:, 0]
+            latents[undecided[fits]] = candidates[fits]
+            undecided = undecided[~fits]
+            if len(undecided) == 0:
+                break
+            spread /= 2
+        columns.view(rows, "latents")[:] = latents.cpu().numpy()
+        return rows
 
 
 class PaperCnnPolicy(CnnFeatures, PaperPolicy):
@@ -175,9 +232,13 @@ class PaperCHDP(CHDP):
             _init_setup_model=_init_setup_model,
         )
 
-    def _latents_of_today(self, replay_data: HybridReplaySamples) -> tuple[HybridReplaySamples, th.Tensor]:
-        drifted = self.actor.codebook.strayed(replay_data.latents, replay_data.discrete_actions)
-        return replay_data, drifted.float().mean()
+    def _make_hybrid_space(self, action_layout: str) -> HybridBox:
+        radices = HybridActionSpec(self.action_space, action_layout).radices
+        width = sum(block_widths(radices, self.latent_dim))
+        return HybridBox(self.action_space, action_layout, width, self._mask_parts())
+
+    def _latents(self, replay_data: HybridReplaySamples) -> th.Tensor:
+        return replay_data.latents
 
     def _parameters_of_latents(self, replay_data: HybridReplaySamples) -> th.Tensor | None:
         return replay_data.parameters

@@ -4,7 +4,6 @@ from copy import deepcopy
 from dataclasses import replace
 from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, get_actor_critic_arch
@@ -25,8 +24,6 @@ from sb3_chdp.common.policies import CnnFeatures, HybridPolicy
 from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.common.utils import default_optimizer_kwargs
 
-# Spread of the latents around a codeword in random actions
-RANDOM_LATENT_NOISE = 0.1
 # Discrete actions that compete beside those drawn, all of them if there are no more; in a factored space changes of one choice
 MAX_ALTERNATIVES = 64
 # Uniformly random actions that compete
@@ -44,7 +41,7 @@ class CHDPPolicy(HybridPolicy):
     All networks see the features of one extractor, which learns from the critics' loss.
 
     :param observation_space: observation space
-    :param action_space: space of the action rows, with ``latent_dim`` latent columns
+    :param action_space: space of the action rows
     :param lr_schedule: learning rate schedule
     :param net_arch: hidden layers, one list for all networks or ``dict(pi=..., qf=...)`` for the noise predictors and
         the critics, that of the reward included; by default ``dict(pi=[128, 128], qf=[256, 256])``
@@ -61,6 +58,7 @@ class CHDPPolicy(HybridPolicy):
 
     fixed_discrete_actions: th.Tensor
     fixed_parameters: th.Tensor
+    actor_class: ClassVar[type[CooperativeActor]] = CooperativeActor
     # Whether the units of the critics follow the rewards, see ValueScale
     adapts_values: ClassVar[bool] = True
     # What critics and continuous policy read of the features, see AttentionReads
@@ -102,9 +100,9 @@ class CHDPPolicy(HybridPolicy):
         self._build(lr_schedule)
 
     def _build(self, lr_schedule: Schedule) -> None:
-        extractor = self.make_features_extractor()
-        self.critic = self._make_critic(extractor)
-        self.actor = self._make_actor(extractor.features_dim)
+        extractor, codebook = self.make_features_extractor(), self._make_codebook()
+        self.critic = self._make_critic(extractor, codebook.latent_dim)
+        self.actor = self._make_actor(extractor.features_dim, codebook)
         self.actor_target, self.critic_target = deepcopy(self.actor), deepcopy(self.critic)
         for target in (self.actor_target, self.critic_target):
             target.requires_grad_(False)
@@ -129,8 +127,8 @@ class CHDPPolicy(HybridPolicy):
         self.register_buffer("fixed_discrete_actions", k, persistent=False)
         self.register_buffer("fixed_parameters", parameters, persistent=False)
 
-    def _make_critic(self, extractor: BaseFeaturesExtractor) -> HybridCritic:
-        latent_dim, n_parameters = self.action_space.latent_dim, self.action_space.spec.max_parameters
+    def _make_critic(self, extractor: BaseFeaturesExtractor, latent_dim: int) -> HybridCritic:
+        n_parameters = self.action_space.spec.max_parameters
         critic_arch = get_actor_critic_arch(self.net_arch)[1]
         q1, q2, rewards = (
             QNetwork(extractor.features_dim, latent_dim, n_parameters, critic_arch, self.activation_fn, self.n_reads)
@@ -138,13 +136,13 @@ class CHDPPolicy(HybridPolicy):
         )
         return HybridCritic(self.observation_space, self.action_space, extractor, [q1, q2], rewards, self.normalize_images)
 
-    def _make_actor(self, features_dim: int) -> CooperativeActor:
-        spec, latent_dim = self.action_space.spec, self.action_space.latent_dim
-        return CooperativeActor(
+    def _make_actor(self, features_dim: int, codebook: Codebook | ProductCodebook) -> CooperativeActor:
+        latent_dim, n_parameters = codebook.latent_dim, self.action_space.spec.max_parameters
+        return self.actor_class(
             self.action_space,
-            self._make_codebook(),
+            codebook,
             self._make_model(latent_dim, features_dim),
-            self._make_model(spec.max_parameters, features_dim + latent_dim + self.n_reads),
+            self._make_model(n_parameters, features_dim + latent_dim + self.n_reads),
             AttentionReads(features_dim, latent_dim, self.n_reads) if self.n_reads else None,
         )
 
@@ -152,7 +150,7 @@ class CHDPPolicy(HybridPolicy):
         spec: HybridActionSpec = self.action_space.spec
         if spec.is_factored:
             return ProductCodebook(spec.radices, self.latent_dim)
-        return Codebook(spec.n_discrete_actions, self.action_space.latent_dim)
+        return Codebook(spec.n_discrete_actions, self.latent_dim)
 
     def _make_model(self, dim: int, condition_dim: int) -> DiffusionModel:
         actor_arch = get_actor_critic_arch(self.net_arch)[0]
@@ -166,7 +164,7 @@ class CHDPPolicy(HybridPolicy):
             self.n_action_candidates, n_random=N_RANDOM_CANDIDATES, **{alternatives: min(n_values, MAX_ALTERNATIVES)}
         )
         target = Selection(N_NEXT_ACTIONS, **{alternatives: min(n_values, N_NEXT_ACTIONS)})
-        return acting, replace(acting, n_refined=N_REFINEMENT_CANDIDATES), target
+        return replace(acting, sampled=True), replace(acting, n_refined=N_REFINEMENT_CANDIDATES), target
 
     def _make_optimizer(self, network: nn.Module, lr_schedule: Schedule) -> th.optim.Optimizer:
         parameters = list(network.parameters())
@@ -191,7 +189,8 @@ class CHDPPolicy(HybridPolicy):
         self, observation: PyTorchObs, deterministic: bool = False, action_masks: th.Tensor | None = None
     ) -> th.Tensor:
         """
-        Draw actions and keep the one that the target critics value most, see :class:`Selection`.
+        Draw actions and keep the one that the target critics value most, see :class:`Selection`; if not deterministic, values
+        are draws between those of both critics.
 
         The noise of deterministic predictions is a function of the observation: one and the same noise in all states would
         repeat a policy's mistakes where sampling gets away from them. They use the target policies, averages of the policies
@@ -205,7 +204,8 @@ class CHDPPolicy(HybridPolicy):
         else:
             select, actor, fixed = self.select, self.acting_actor, None
         latents, k, parameters = select(actor, self.critic_target, features, fixed, action_masks)
-        return self.action_space.columns.pack(discrete_actions=k.float(), parameters=parameters, latents=latents)
+        stored_latents = latents[:, : self.action_space.latent_dim]
+        return self.action_space.columns.pack(discrete_actions=k.float(), parameters=parameters, latents=stored_latents)
 
     def _fixed_draws(self, observation: PyTorchObs) -> FixedDraws:
         """:return: what deterministic predictions take for all that is random, the same for every model"""
@@ -218,27 +218,6 @@ class CHDPPolicy(HybridPolicy):
             )
         )
         return FixedDraws(latent_noise, parameter_noise, self.fixed_discrete_actions, self.fixed_parameters)
-
-    def random_rows(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
-        """Uniformly random actions; their latents scatter around the codewords and decode to the actions."""
-        rows, columns = super().random_rows(rng, n, masks), self.action_space.columns
-        k = th.as_tensor(columns.discrete_actions(rows), device=self.device)
-        codebook = self.actor.codebook
-        centres = codebook.representative_latents(k)
-        latents = centres.clone()
-        undecided = th.arange(n, device=self.device)
-        spread = RANDOM_LATENT_NOISE
-        for _ in range(5):
-            noise = th.as_tensor(rng.normal(0, spread, (len(undecided), centres.shape[1])), dtype=th.float32)
-            candidates = (centres[undecided] + noise.to(self.device)).clamp(-1, 1)
-            fits = ~codebook.strayed(candidates, k[undecided]).any(dim=1)
-            latents[undecided[fits]] = candidates[fits]
-            undecided = undecided[~fits]
-            if len(undecided) == 0:
-                break
-            spread /= 2
-        columns.view(rows, "latents")[:] = latents.cpu().numpy()
-        return rows
 
     def in_units_of_critics(self, targets: th.Tensor) -> th.Tensor:
         """

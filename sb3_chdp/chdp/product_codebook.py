@@ -35,14 +35,6 @@ class ProductCodebook(ProductTable):
         """:return: (..., d_e) latents that stand for the (..., L) discrete actions, their codewords"""
         return self(k).detach()
 
-    def strayed(self, latents: th.Tensor, k: th.Tensor) -> th.Tensor:
-        """
-        :param latents: (B, d_e)
-        :param k: (B, L) discrete actions
-        :return: (B, d_e) which entries belong to a choice that does not decode to its value in k
-        """
-        return (self.quantize(latents) != k)[:, self.choice_of_slot]
-
     def random(self, *shape: int, generator: th.Generator | None = None, masks: th.Tensor | None = None) -> th.Tensor:
         """
         :param shape: how many actions; its first number is B if there are masks
