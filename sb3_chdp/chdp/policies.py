@@ -159,11 +159,12 @@ class CHDPPolicy(HybridPolicy):
     def _make_selections(self) -> tuple[Selection, Selection, Selection]:
         """:return: rules for acting, for deterministic predictions and for next actions"""
         spec = self.action_space.spec
-        alternatives, n_values = "n_changed" if spec.is_factored else "n_uniform", sum(spec.radices)
-        acting = Selection(
-            self.n_action_candidates, n_random=N_RANDOM_CANDIDATES, **{alternatives: min(n_values, MAX_ALTERNATIVES)}
-        )
-        target = Selection(N_NEXT_ACTIONS, **{alternatives: min(n_values, N_NEXT_ACTIONS)})
+
+        def alternatives(n_most: int) -> dict[str, Any]:
+            return {"n_changed" if spec.is_factored else "n_uniform": min(sum(spec.radices), n_most)}
+
+        acting = Selection(self.n_action_candidates, n_random=N_RANDOM_CANDIDATES, **alternatives(MAX_ALTERNATIVES))
+        target = Selection(N_NEXT_ACTIONS, **alternatives(N_NEXT_ACTIONS))
         return replace(acting, sampled=True), replace(acting, n_refined=N_REFINEMENT_CANDIDATES), target
 
     def _make_optimizer(self, network: nn.Module, lr_schedule: Schedule) -> th.optim.Optimizer:
