@@ -131,10 +131,8 @@ def test_chdp_sets_priorities_to_the_errors_of_its_critics(tmp_path):
     model.train(1, 16)
     changed = buffer.priorities[:50] != 7
     assert 0 < changed.sum() <= 16
-    # Random latents, which decode to their actions, are as they were stored
-    latents, parameters = (
-        th.as_tensor(columns.view(buffer.actions[:50], name)[changed]) for name in ("latents", "parameters")
-    )
+    rows = th.as_tensor(buffer.actions[:50][changed])
+    latents, parameters = model.actor.codebook(columns.discrete_actions(rows)), columns.view(rows, "parameters")
     model.policy.set_training_mode(False)
     with th.no_grad():
         features = model.critic.features(th.as_tensor(buffer.observations[:50][changed]))
