@@ -97,8 +97,9 @@ def test_sequential_update(table, name):
     n_uniform = round(400 * model.uniform_fraction)
     is_stored = (improved[n_uniform:] == stored[n_uniform:]).all(dim=1)
     is_sequential = name not in ("without_sequential_update", "without_both")
-    # CHDP's latents of one action are the same
-    assert is_stored.float().mean() < 0.8 if is_sequential else is_stored.all()
+    # CHDP's latents of one action are the same, so that drawn and stored ones are equal now and then
+    most = 0.1 if table == "chdp_paper_" else 0.8
+    assert is_stored.float().mean() < most if is_sequential else is_stored.all()
 
 
 @pytest.mark.parametrize("table", TABLES)

@@ -12,7 +12,7 @@ from torch.nn.utils import parameters_to_vector
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import PaperCHDP
 from tests.algorithms import calls_of, fast_model, filled_model, sample
-from tests.hybrid_envs import HybridIdentityEnv, make_layout_env
+from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, make_layout_env
 
 
 @pytest.fixture
@@ -28,6 +28,25 @@ def test_stored_latents_stay(model):
     model.train(1, 32)
     stored = th.as_tensor(model.hybrid_space.columns.view(model.replay_buffer.actions[:60, 0], "latents"))
     assert (calls[0][1][:, None] == stored).all(dim=2).any(dim=1).all()
+
+
+@pytest.mark.parametrize("layout", ["joint", "factored"])
+def test_latents_of_forbidden_actions_give_way(layout):
+    """To the nearest allowed codeword, with the gradient of what was drawn; others stay as they are."""
+    env = LayoutEnv(spaces.Tuple((spaces.MultiDiscrete([2, 3]), box(-1, 1, 1))))
+    actor = fast_model(PaperCHDP, env, action_layout=layout).actor
+    codebook, drawn = actor.codebook, (2 * th.rand(200, actor.codebook.latent_dim) - 1).requires_grad_()
+    actor.discrete_policy.sample = lambda features, noise=None: drawn
+    masks = th.ones(200, 6 if layout == "joint" else 5, dtype=th.bool)
+    masks[:, 0] = False
+    free = codebook.quantize(drawn)
+    latents, k = actor.sample_latents(th.zeros(200, 1), masks=masks)
+    assert (codebook.quantize(latents) == k).all() and (k.view(200, -1)[:, 0] != 0).all()
+    moved = (k != free).view(200, -1).any(dim=1)
+    assert 0 < moved.sum() < 200 and th.equal(latents[~moved], drawn[~moved])
+    assert th.equal(latents[moved], codebook.representative_latents(k)[moved])
+    latents.sum().backward()
+    assert (drawn.grad == 1).all()
 
 
 def test_latents_are_valued_with_the_stored_parameters(model):
