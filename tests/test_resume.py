@@ -72,6 +72,16 @@ def test_in_an_interpreter_of_its_own(whole_run, tmp_path):
     assert_equal(outcome, whole_run)
 
 
+def test_where_nothing_has_imported_the_algorithm(tmp_path):
+    make_model(PATD3, gym.make("sb3_chdp/Goal-v0")).learn(25, ResumableCheckpoint(10, tmp_path))
+    code = (
+        "import sys, gymnasium as gym, sb3_chdp; from sb3_chdp.common.resume import resume;"
+        "print(type(resume(sys.argv[1], gym.make('sb3_chdp/Goal-v0'))).__name__)"
+    )
+    result = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True)
+    assert result.stdout.split() == ["PATD3"], result.stderr
+
+
 def test_a_finished_run_stays_as_it_is(whole_run, tmp_path):
     run(tmp_path, "PATD3-4")
     checkpoints = generations(tmp_path / "checkpoints")

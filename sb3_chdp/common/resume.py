@@ -4,6 +4,8 @@ import io
 import tempfile
 import time
 import warnings
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 from weakref import WeakKeyDictionary
@@ -221,7 +223,11 @@ class ResumableCheckpoint(BaseCallback):
 
 
 def _algorithm(name: str) -> type[BaseAlgorithm]:
-    """:return: the algorithm of that name among those that are imported: a checkpoint cannot have others run"""
+    """:return: the algorithm of that name, of this package or imported already: a checkpoint cannot have others run"""
+    module, package = name.rpartition(".")[0], __name__.partition(".")[0]
+    if module.startswith(f"{package}."):
+        with suppress(ModuleNotFoundError):
+            import_module(module)
     classes: list[type] = [BaseAlgorithm]
     for cls in classes:
         classes.extend(cls.__subclasses__())
