@@ -27,7 +27,7 @@ SETTINGS: dict[type, dict[str, Any]] = {
 def final_reward(algorithm, gamma, seed=0):
     env = make_vec_env(HybridChainEnv, 8, seed=seed)
     model = algorithm("MlpPolicy", env, seed=seed, gamma=gamma, **SETTINGS[algorithm])
-    model.learn(3000 if algorithm is HyARTD3 else 1600)
+    model.learn({HyARTD3: 3000, CHDP: 1200}.get(algorithm, 1600))
     # Environment and policy are deterministic
     return evaluate_policy(model, make_vec_env(HybridChainEnv, 1), 1)[0]
 

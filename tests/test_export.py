@@ -79,7 +79,7 @@ def check(model, tmp_path, n=N):
         np.testing.assert_allclose((parameters - spec.centre[options]) / half, own_parameters, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) if x == "PaperCHDP" else x for x in ALGORITHMS])
 def test_every_algorithm(name, tmp_path):
     # Others decide the same everywhere before they are trained
     seed = 2 if name == "CHDP" else 1
@@ -129,7 +129,7 @@ def test_many_discrete_actions(tmp_path):
     check(sb3_chdp.HyARTD3("MlpPolicy", LayoutEnv(MANY), seed=0, buffer_size=10), tmp_path, n=50)
 
 
-@pytest.mark.parametrize("name", ["CHDP", "HPPO", "PATD3", "HHQNTD3", "HyARTD3"])
+@pytest.mark.parametrize("name", [pytest.param("CHDP", marks=pytest.mark.slow), "HPPO", "PATD3", "HHQNTD3", "HyARTD3"])
 def test_factored_actions(name, tmp_path):
     check(getattr(sb3_chdp, name)("MlpPolicy", LayoutEnv(FACTORED), seed=0), tmp_path, n=50)
 

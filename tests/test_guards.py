@@ -89,8 +89,7 @@ PLACES = {
 }
 
 
-@pytest.mark.parametrize("value", [np.nan, -np.inf, 1e38], ids=str)
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize(("place", "value"), [*((place, np.nan) for place in PLACES), ("next", -np.inf), ("reward", 1e38)])
 def test_bad_numbers_are_refused(algorithm, place, value):
     env = DummyVecEnv([make_shared_env, lambda: BrokenEnv(place, value)])
     model = make_model(algorithm, env)

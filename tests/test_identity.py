@@ -32,8 +32,8 @@ SETTINGS: dict[type, dict[str, Any]] = {
     ),
     HPPO: dict(n_steps=64, batch_size=64, learning_rate=1e-3),
 }
-# Environment steps, PaperCHDP learns slowest
-BUDGETS = {**dict.fromkeys(SETTINGS, 2000), PaperCHDP: 4000, HPPO: 3000}
+# Environment steps
+BUDGETS = {**dict.fromkeys(SETTINGS, 2000), CHDP: 1500, PaperCHDP: 3000, HPPO: 3000}
 
 
 def success(model):

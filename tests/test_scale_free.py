@@ -64,7 +64,7 @@ def test_the_same_actions(env_class):
 def test_the_task_is_learnt_in_other_units():
     settings = dict(gradient_steps=2, learning_starts=200, gamma=0.0, policy_kwargs=dict(net_arch=[64, 64]), seed=0)
     env_class = in_units(HybridIdentityEnv, **UNITS)
-    model = CHDP("MlpPolicy", make_vec_env(env_class, 8, seed=0), **settings).learn(2000)
+    model = CHDP("MlpPolicy", make_vec_env(env_class, 8, seed=0), **settings).learn(1500)
     env = make_vec_env(env_class, 8, seed=100)
     returns, _ = evaluate_policy(model, env, 200, deterministic=True, return_episode_rewards=True)
     # tests/test_identity.py says what is in reach without learning
