@@ -17,7 +17,7 @@ from tests.hybrid_envs import LayoutEnv, box, layouts, make_layout_env
 ort = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
-ALGORITHMS = ["CHDP", "PaperCHDP", "HPPO", "PATD3", "PDQNTD3", "HHQNTD3", "HyARTD3"]
+ALGORITHMS = ["CHDP", pytest.param("PaperCHDP", marks=pytest.mark.slow), "HPPO", "PATD3", "PDQNTD3", "HHQNTD3", "HyARTD3"]
 N = 1_000
 MODEL = Path(__file__).parent.parent / "benchmarks" / "models" / "chdp" / "Platform-v0_1" / "Platform-v0.zip"
 PAGE = Path(__file__).parent.parent / "docs" / "guide" / "export.md"
@@ -79,7 +79,7 @@ def check(model, tmp_path, n=N):
         np.testing.assert_allclose((parameters - spec.centre[options]) / half, own_parameters, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) if x == "PaperCHDP" else x for x in ALGORITHMS])
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_algorithm(name, tmp_path):
     # Others decide the same everywhere before they are trained
     seed = 2 if name == "CHDP" else 1
