@@ -79,7 +79,7 @@ def test_codebook_gradient_comes_through_the_continuous_chain_only(algorithm_cla
     """With a chain that ignores its condition the codebook gets no gradient, though Q depends on everything."""
     model = filled_model(algorithm_class=algorithm_class)
     with th.no_grad():
-        model.actor.continuous_policy.noise_predictor.split_first_layer()[2].zero_()
+        model.actor.continuous_policy.noise_predictor.of_condition.weight.zero_()
     assert "codebook" not in networks_with_gradient(model, all_losses(model)["continuous improvement"])
 
 
@@ -111,7 +111,7 @@ def test_continuous_step_sees_the_updated_discrete_policy(algorithm_class):
     model = filled_model(algorithm_class=algorithm_class, **delay)
     predictor = model.actor.discrete_policy.noise_predictor
     weights = []
-    predictor.register_forward_pre_hook(lambda *_: weights.append(predictor.first_layer.weight.detach().clone()))
+    predictor.register_forward_pre_hook(lambda *_: weights.append(predictor.of_x.weight.detach().clone()))
     model.train(1, 32)
     n = model.n_diffusion_steps
     # Its diffusion loss and a chain in step 1, a chain in step 2

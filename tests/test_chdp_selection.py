@@ -57,7 +57,7 @@ def actor():
 
 def random_features(actor, n):
     # Both policies see them, the continuous one more besides
-    return th.randn(n, actor.discrete_policy.noise_predictor.widths[-1])
+    return th.randn(n, actor.discrete_policy.noise_predictor.of_condition.in_features)
 
 
 @SELECTIONS

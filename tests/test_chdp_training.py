@@ -64,7 +64,7 @@ def test_policy_delay():
     # The codebook, which critics train, is part of the actor
     assert moved == {"critic", "actor"}
     assert "train/continuous_loss" not in model.logger.name_to_value
-    predictor = "actor.discrete_policy.noise_predictor.first_layer.weight"
+    predictor = "actor.discrete_policy.noise_predictor.of_x.weight"
     assert th.equal(dict(model.policy.named_parameters())[predictor], before[predictor])
     model.train(1, 32)
     assert not th.equal(dict(model.policy.named_parameters())[predictor], before[predictor])

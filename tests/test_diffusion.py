@@ -135,10 +135,12 @@ def test_step_and_condition_change_the_prediction():
     assert (outputs[0] - predictor(x, by_step[0].expand(5, -1))).abs().max() > 1e-5
 
 
-def test_split_first_layer_equals_the_layer_on_the_concatenation():
+def test_parts_of_the_first_layer_are_one_layer_on_the_concatenation():
     predictor, x, condition = DiffusionModel(3, 2, 4, [16, 16]).noise_predictor, th.randn(5, 3), th.randn(5, 2)
     embedding = predictor.time_mlp(predictor.sinusoids)[2].expand(5, -1)
-    hidden = predictor.first_layer(th.cat([x, embedding, condition], dim=1))
+    parts = (predictor.of_x, predictor.of_step, predictor.of_condition)
+    weight = th.cat([part.weight for part in parts], dim=1)
+    hidden = th.nn.functional.linear(th.cat([x, embedding, condition], dim=1), weight, predictor.of_step.bias)
     by_condition, by_step = predictor.contexts(condition)
     th.testing.assert_close(predictor(x, by_condition + by_step[2]), predictor.trunk(hidden))
 

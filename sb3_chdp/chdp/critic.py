@@ -11,6 +11,8 @@ from torch import nn
 
 # Factor of the logits, which start small
 SHARPNESS = 3.0
+# Over fewer entries side by side, softmax on a processor takes several times as long as over entries further apart
+SLOW_SOFTMAX = 16
 
 
 class AttentionReads(nn.Module):
@@ -36,7 +38,11 @@ class AttentionReads(nn.Module):
         :param latents: (B, latent_dim)
         :return: (B, n_reads)
         """
-        weights = (SHARPNESS * self.logits(latents).unflatten(1, (self.n_reads, self.n_inputs))).softmax(dim=2)
+        logits = SHARPNESS * self.logits(latents).unflatten(1, (self.n_reads, self.n_inputs))
+        if self.n_inputs < SLOW_SOFTMAX:
+            weights = logits.transpose(1, 2).contiguous().softmax(dim=1).transpose(1, 2)
+        else:
+            weights = logits.softmax(dim=2)
         return th.bmm(weights, x[:, :, None]).squeeze(2)
 
 

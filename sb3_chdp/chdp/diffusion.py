@@ -39,7 +39,7 @@ class NoiseSchedule:
 
 class NoisePredictor(nn.Module):
     """
-    MLP eps(x_i, i, condition) whose first layer is split into a part for x, one for the step and one for the condition.
+    MLP eps(x_i, i, condition), whose first layer has a part for x, one for the step and one for the condition.
 
     In a chain the condition's part is computed once, and the parts of all N steps once for all rows.
 
@@ -60,22 +60,21 @@ class NoisePredictor(nn.Module):
         angles = th.arange(1, n_steps + 1)[:, None] * frequencies
         self.register_buffer("sinusoids", th.cat([angles.sin(), angles.cos()], dim=1), persistent=False)
         self.time_mlp = nn.Sequential(nn.Linear(TIME_DIM, 2 * TIME_DIM), activation_fn(), nn.Linear(2 * TIME_DIM, TIME_DIM))
-        # Initialised as the one layer that it stands for
-        self.first_layer = nn.Linear(dim + TIME_DIM + condition_dim, net_arch[0])
-        self.widths = [dim, TIME_DIM, condition_dim]
+        self.of_x = nn.Linear(dim, net_arch[0], bias=False)
+        self.of_step = nn.Linear(TIME_DIM, net_arch[0])
+        self.of_condition = nn.Linear(condition_dim, net_arch[0], bias=False)
+        # As the one layer that they stand for
+        bound = 1 / math.sqrt(dim + TIME_DIM + condition_dim)
+        for parameter in (self.of_x.weight, *self.of_step.parameters(), self.of_condition.weight):
+            nn.init.uniform_(parameter, -bound, bound)
         self.trunk = nn.Sequential(activation_fn(), *create_mlp(net_arch[0], dim, net_arch[1:], activation_fn))
-
-    def split_first_layer(self) -> list[th.Tensor]:
-        """:return: weights of the first layer for x, step and condition"""
-        return list(self.first_layer.weight.split(self.widths, dim=1))
 
     def contexts(self, condition: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         :param condition: (B, condition_dim)
         :return: what the condition (B, H) and what each of the N steps (N, H) adds to the first layer
         """
-        _, w_step, w_condition = self.split_first_layer()
-        return F.linear(condition, w_condition), F.linear(self.time_mlp(self.sinusoids), w_step, self.first_layer.bias)
+        return self.of_condition(condition), self.of_step(self.time_mlp(self.sinusoids))
 
     def forward(self, x: th.Tensor, context: th.Tensor) -> th.Tensor:
         """
@@ -83,7 +82,7 @@ class NoisePredictor(nn.Module):
         :param context: (B, H) sum of what condition and step add to the first layer
         :return: (B, dim) predicted noise
         """
-        return self.trunk(th.addmm(context, x, self.split_first_layer()[0].t()))
+        return self.trunk(th.addmm(context, x, self.of_x.weight.t()))
 
 
 class DiffusionModel(nn.Module):
@@ -128,8 +127,8 @@ class DiffusionModel(nn.Module):
         schedule = self.schedule
         by_condition, by_step = self.noise_predictor.contexts(condition)
         x = noise[0] if mask is None else noise[0] * mask
-        # In the order of the steps, N to 2
-        injected = noise[1:] * self.injected_sigmas
+        # Of the steps N to 2
+        injected = (noise[1:] * self.injected_sigmas).unbind()
         for i in reversed(range(self.n_steps)):
             predicted = self.noise_predictor(x, by_condition + by_step[i])
             signal = schedule.signal[i]
@@ -138,8 +137,8 @@ class DiffusionModel(nn.Module):
             if i == 0:
                 x = scaled_start / signal
             else:
-                mean = th.add(schedule.mean_x[i] * x, scaled_start, alpha=schedule.mean_start[i] / signal)
-                x = mean + injected[-i]
+                from_x = th.add(injected[-i], x, alpha=schedule.mean_x[i])
+                x = th.add(from_x, scaled_start, alpha=schedule.mean_start[i] / signal)
             if mask is not None:
                 x = x * mask
         return x
