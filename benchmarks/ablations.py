@@ -147,7 +147,7 @@ class PaperWithoutCodebook(WithoutCodebook, PaperCHDP):
 
     def _make_hybrid_space(self, action_layout: str) -> HybridBox:
         n_discrete_actions = HybridActionSpec(self.action_space, action_layout).n_discrete_actions
-        return HybridBox(self.action_space, action_layout, n_discrete_actions, self._mask_parts())
+        return HybridBox(self.action_space, action_layout, n_discrete_actions, self._state_parts())
 
 
 class PaperWithoutSequentialUpdate(WithoutSequentialUpdate, PaperCHDP):

@@ -145,7 +145,7 @@ def test_it_is_saved(tmp_path):
 def test_ends_of_episodes(monkeypatch):
     """Nothing follows a terminal state; what follows a time limit is not known, as the next episode has begun."""
     model = filled_model(DummyVecEnv([lambda: make_layout_env("nested")] * 3))
-    monkeypatch.setattr(exploring, "next_values", lambda policy, observation, masks: th.full((3, 1), 7.0))
+    monkeypatch.setattr(exploring, "next_values", lambda policy, observation, masks, returns: th.full((3, 1), 7.0))
     model.policy.value_scale.variance += 4 - model.policy.value_scale.variance
     model.policy.value_scale.center[0] = 2.0
     claims = Claims(np.empty((3, 0)), np.arange(3), np.zeros(3), np.array([1.0, 10.0, 100.0]), np.array([0.5, 0.5, 0.5]))

@@ -195,4 +195,4 @@ def test_targets_take_over_the_statistics_of_each_update():
 def test_another_extractor_may_take_its_place():
     model = fast_model(policy_kwargs=dict(features_extractor_class=FlattenExtractor, net_arch=[16])).learn(40)
     assert model.critic.features_extractor.features_dim == 4
-    assert not any(isinstance(module, RunningNormalization) for module in model.policy.modules())
+    assert not any(isinstance(module, RunningNormalization) for module in model.critic.features_extractor.modules())

@@ -109,7 +109,7 @@ def test_native_actions(space, data, seed):
 def test_masks(space, data, seed):
     """Rows that masks allow, whichever kind of rows, are of values that they allow."""
     kind = data.draw(st.sampled_from([HybridBox, ConcatenatedBox, ScoreBox]))
-    rows_space = kind(space, layout_of(space, data), mask_parts=("masks", "next_masks"))
+    rows_space = kind(space, layout_of(space, data), state_parts=("masks", "next_masks"))
     spec, rng = rows_space.spec, np.random.default_rng(seed)
     digits = spec._digits
     starts = np.cumsum((0, *digits[:-1]))

@@ -248,7 +248,7 @@ def test_rows_are_sampled_and_told_apart(layout, kind):
 
 
 def test_rows_with_masks():
-    space = ConcatenatedBox(layouts()["nested"], mask_parts=("masks", "next_masks"))
+    space = ConcatenatedBox(layouts()["nested"], state_parts=("masks", "next_masks"))
     assert space.shape == (1 + 3 + 2,) and space.columns.action_width == 4
     assert space.low.tolist() == [0, -1, -1, -1, 0, 0] and space.high.tolist() == [2, 1, 1, 1, 2**16 - 1, 2**16 - 1]
     assert pickle.loads(pickle.dumps(space)) == space != ConcatenatedBox(layouts()["nested"])

@@ -48,15 +48,16 @@ class CHDP(ExploringAlgorithm):
         2. critics have layer normalisation, a state value of their own and read parts of the state, see :class:`QNetwork`;
         3. the critics' loss trains the codebook too, so that actions of similar effect get similar codewords; these are what
            critics see of a discrete action, not the latents around them that decode to it, see :class:`CooperativeActor`;
-        4. of several actions the one that critics value most acts, and is the next action in targets; while training, those
+        4. the values of next states know what the episode has returned so far, see :class:`HybridCritic`;
+        5. of several actions the one that critics value most acts, and is the next action in targets; while training, those
            that they disagree about are tried, see :class:`Selection`;
-        5. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
+        6. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
            stored ones, and the continuous policy for uniformly random discrete actions too;
-        6. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate`,
+        7. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate`,
            :func:`informative_steps` and :func:`vary_parts`;
-        7. a network learns rewards, and what follows a reward counts less in the choice of actions where
+        8. a network learns rewards, and what follows a reward counts less in the choice of actions where
            exploratory actions have shown no influence on it, see :class:`ForesightSums`;
-        8. the learning rate falls linearly to 0.
+        9. the learning rate falls linearly to 0.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str), with a hybrid action space
@@ -196,7 +197,7 @@ class CHDP(ExploringAlgorithm):
         )
 
     def _make_hybrid_space(self, action_layout: str) -> HybridBox:
-        return HybridBox(self.action_space, action_layout, mask_parts=self._mask_parts())
+        return HybridBox(self.action_space, action_layout, state_parts=self._state_parts())
 
     def _setup_model(self) -> None:
         super()._setup_model()

@@ -8,11 +8,14 @@ from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
+from torch.nn import functional as F
 
 # Factor of the logits, which start small
 SHARPNESS = 3.0
 # Over fewer entries side by side, softmax on a processor takes several times as long as over entries further apart
 SLOW_SOFTMAX = 16
+# What an episode has returned, and whether that is known
+N_RETURN_FEATURES = 2
 
 
 class AttentionReads(nn.Module):
@@ -108,10 +111,15 @@ class HybridCritic(BaseModel):
     """
     Twin critic Q(s, latent, parameters), with the features of the state computed once for several calls.
 
+    It may also be told what the episode has returned before the action (the critic knows more than the policies, as in Pinto
+    et al., 2017). Rewards often depend on what observations do not show: a bonus that is paid once per episode, say. Where the
+    value of a next state is an average over both cases, it looks as if going back earned the bonus once more.
+
     :param observation_space: observation space
     :param action_space: space of the action rows
     :param features_extractor: network to extract features
     :param q_networks: two networks of features, latents and parameters
+    :param return_normalization: of what the episode has returned; None: the networks cannot be told
     :param reward_network: such a network of the reward alone, for foresight below 1; None: foresight is always 1
     :param normalize_images: whether to divide images by 255
 
@@ -120,6 +128,7 @@ class HybridCritic(BaseModel):
 
     features_extractor: BaseFeaturesExtractor
     optimizer: th.optim.Optimizer
+    return_normalization: nn.Module | None
     reward_network: nn.Module | None
 
     def __init__(
@@ -128,6 +137,7 @@ class HybridCritic(BaseModel):
         action_space: spaces.Box,
         features_extractor: BaseFeaturesExtractor,
         q_networks: list[nn.Module],
+        return_normalization: nn.Module | None = None,
         reward_network: nn.Module | None = None,
         normalize_images: bool = True,
     ):
@@ -135,6 +145,7 @@ class HybridCritic(BaseModel):
             observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
         )
         self.q_networks = nn.ModuleList(q_networks)
+        self.return_normalization = return_normalization
         self.reward_network = reward_network
         self.foresight = 1.0
 
@@ -142,14 +153,31 @@ class HybridCritic(BaseModel):
         """:return: (B, features_dim) features of the observations"""
         return self.extract_features(obs, self.features_extractor)
 
-    def q_values(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def with_returns(self, features: th.Tensor, returns: th.Tensor | None) -> th.Tensor:
+        """
+        :param features: (B, features_dim) from :meth:`features`
+        :param returns: (B, 1) what episodes have returned, in their own units; None: not known
+        :return: (B, n) inputs of the networks: the features, normalised returns and whether they are known
+        """
+        if self.return_normalization is None:
+            return features
+        if returns is None:
+            return F.pad(features, (0, N_RETURN_FEATURES))
+        known = th.ones_like(returns)
+        return th.cat([features, self.return_normalization(returns), known], dim=1)
+
+    def q_values(
+        self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor, returns: th.Tensor | None = None
+    ) -> tuple[th.Tensor, th.Tensor]:
         """
         :param features: (B, features_dim) from :meth:`features`
         :param latents: (B, latent_dim)
         :param parameters: (B, n_parameters) scaled parameters
+        :param returns: (B, 1) what episodes have returned before the action; None: not known
         :return: Q1 and Q2, each (B, 1), in the units of :class:`ValueScale`
         """
-        q1, q2 = (q_net(features, latents, parameters) for q_net in self.q_networks)
+        inputs = self.with_returns(features, returns)
+        q1, q2 = (q_net(inputs, latents, parameters) for q_net in self.q_networks)
         return q1, q2
 
     def scores(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> tuple[th.Tensor, ...]:
@@ -160,7 +188,8 @@ class HybridCritic(BaseModel):
 
     def score1(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
         """:return: (B, 1) the first of :meth:`scores` alone"""
-        return self.weigh((self.q_networks[0](features, latents, parameters),), features, latents, parameters)[0]
+        q1 = self.q_networks[0](self.with_returns(features, None), latents, parameters)
+        return self.weigh((q1,), features, latents, parameters)[0]
 
     def weigh(
         self, q_values: tuple[th.Tensor, ...], features: th.Tensor, latents: th.Tensor, parameters: th.Tensor

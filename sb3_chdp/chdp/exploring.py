@@ -1,6 +1,6 @@
 """What CHDP does to explore, and what it learns about itself from that."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -13,6 +13,7 @@ from sb3_chdp.chdp.foresight import Claims, ForesightSums, explore
 from sb3_chdp.chdp.losses import next_values
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
+from sb3_chdp.common.rows import RETURN_PARTS
 
 # Claims of critics that have hardly learnt are no matter
 MIN_UPDATES = 200
@@ -32,6 +33,8 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
     """
 
     policy: CHDPPolicy
+    # Whether rows hold what episodes have returned, which targets then know
+    knows_returns: ClassVar[bool] = True
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
@@ -58,6 +61,9 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
             self.n_informative_steps, self.return_sums = 0.0, ReturnSums()
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
+    def _state_parts(self) -> tuple[str, ...]:
+        return (*super()._state_parts(), *(RETURN_PARTS if self.knows_returns else ()))
+
     def _exploration_rate(self) -> float:
         n_values = sum(self.hybrid_space.spec.radices)
         # Many environments make many steps before anything is learnt from them
@@ -73,20 +79,24 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         return self._claims.rows
 
     def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any) -> None:
+        rows, new_obs, rewards, dones, infos = args
+        self._add_rewards(rows, rewards)
         super()._store_transition(replay_buffer, *args)
-        _, new_obs, rewards, dones, infos = args
-        self._count_returns(replay_buffer)
         if self._claims is not None and self._n_updates >= MIN_UPDATES:
             self._check_claims(self._claims, new_obs, rewards, dones, infos)
         self._claims = None
+        self._count_returns(dones)
 
-    def _count_returns(self, replay_buffer: ReplayBuffer) -> None:
+    def _add_rewards(self, rows: np.ndarray, rewards: np.ndarray) -> None:
         # As the environment gave them, within VecNormalize too
-        latest = replay_buffer.pos - 1
-        rewards, dones = replay_buffer.rewards[latest].tolist(), replay_buffer.dones[latest]
-        if len(self.returns_so_far) != self.n_envs:
-            self.returns_so_far = [0.0] * self.n_envs
-        self.returns_so_far = [value + reward for value, reward in zip(self.returns_so_far, rewards, strict=True)]
+        own = rewards if self._vec_normalize_env is None else self._vec_normalize_env.get_original_reward()
+        before = self.returns_so_far if len(self.returns_so_far) == self.n_envs else [0.0] * self.n_envs
+        self.returns_so_far = [value + reward for value, reward in zip(before, own.tolist(), strict=True)]
+        if self.knows_returns:
+            for name, values in zip(RETURN_PARTS, (before, self.returns_so_far), strict=True):
+                self.hybrid_space.columns.view(rows, name)[:, 0] = values
+
+    def _count_returns(self, dones: np.ndarray) -> None:
         returns = ReturnSums(*self.return_sums)  # a list in a loaded model
         for i in np.flatnonzero(dones):
             returns = returns.add(self.returns_so_far[i])
@@ -100,7 +110,8 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         """Compare what was claimed to come of exploratory actions with the rewards and the values of what followed."""
         masks = self._action_masks()
         next_masks = None if masks is None else th.as_tensor(masks, device=self.device)
-        values = next_values(self.policy, self.policy.obs_to_tensor(new_obs)[0], next_masks)
+        returns = th.tensor(self.returns_so_far, dtype=th.float32, device=self.device)[:, None]
+        values = next_values(self.policy, self.policy.obs_to_tensor(new_obs)[0], next_masks, returns)
         came = th.as_tensor(rewards + self.gamma * (1 - dones) * values.flatten().cpu().numpy(), device=self.device)
         outputs = self.policy.value_scale.outputs(th.stack([came, came], dim=1))[:, 0]
         outcomes = outputs.clamp(-LARGEST_OUTCOME, LARGEST_OUTCOME).tolist()

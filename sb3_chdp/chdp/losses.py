@@ -8,7 +8,9 @@ from sb3_chdp.common.samples import HybridReplaySamples
 
 
 @th.no_grad()
-def next_values(policy: CHDPPolicy, observations: PyTorchObs, masks: th.Tensor | None = None) -> th.Tensor:
+def next_values(
+    policy: CHDPPolicy, observations: PyTorchObs, masks: th.Tensor | None = None, returns: th.Tensor | None = None
+) -> th.Tensor:
     """
     min_j Q'_j(s', e', a') of the best action (e', a') among a few of the target policies.
 
@@ -18,11 +20,12 @@ def next_values(policy: CHDPPolicy, observations: PyTorchObs, masks: th.Tensor |
     :param policy: the networks
     :param observations: (B, ...) next observations
     :param masks: (B, K) False for discrete actions that may not be taken, None if all may
+    :param returns: (B, 1) what episodes have returned, which the policies do not know; None: the critics do not either
     :return: (B, 1) values in the units of the rewards, with all that follows
     """
     features = policy.critic_target.features(observations)
     latents, _, parameters = policy.select_target(policy.actor_target, policy.choosing_critic, features, masks=masks)
-    q1, q2 = policy.critic_target.q_values(features, latents, parameters)
+    q1, q2 = policy.critic_target.q_values(features, latents, parameters, returns)
     return policy.value_scale.values(th.min(q1, q2))
 
 
@@ -36,7 +39,7 @@ def target_values(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> th.Te
     :param replay_data: a batch
     :return: (B, 2) values and rewards, in the units of the rewards
     """
-    values = next_values(policy, replay_data.next_observations, replay_data.next_masks)
+    values = next_values(policy, replay_data.next_observations, replay_data.next_masks, replay_data.next_returns)
     follows = (1 - replay_data.dones) * replay_data.discounts * values
     return th.cat([replay_data.rewards + follows, replay_data.rewards], dim=1)
 
@@ -45,7 +48,8 @@ def critic_loss(
     policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, targets: th.Tensor
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """
-    Eq. 10, (Q_j(s, e, a) - y)^2, weighted if the replay is prioritised.
+    Eq. 10, (Q_j(s, e, a) - y)^2, weighted if the replay is prioritised; half of it for critics that know what the episode has
+    returned, half for critics that do not, if rows tell.
 
     It has a gradient for the codebook, which may be used.
 
@@ -53,15 +57,20 @@ def critic_loss(
     :param replay_data: a batch
     :param features: (B, features_dim) features of the observations
     :param targets: (B, 1) targets y in the units of the critics
-    :return: sum over both critics, the detached (B, 1) values of the first, and the larger (B,) absolute error of both
+    :return: sum over both critics, and without knowledge of returns the detached (B, 1) values of the first and the larger
+        (B,) absolute error of both
     """
     # The gradient with respect to a latent is also that of the codeword
     codewords = policy.actor.codebook(replay_data.discrete_actions)
     latents = replay_data.latents + (codewords - codewords.detach())
-    q_values = th.cat(policy.critic.q_values(features, latents, replay_data.parameters), dim=1)
-    errors = q_values - targets
-    loss = (replay_data.weights * errors.square()).sum(dim=1).mean()
-    return loss, q_values[:, :1].detach(), errors.detach().abs().amax(dim=1)
+
+    inputs = features, latents, replay_data.parameters
+    q_values = [th.cat(policy.critic.q_values(*inputs), dim=1)]
+    if replay_data.returns is not None:
+        q_values.append(th.cat(policy.critic.q_values(*inputs, replay_data.returns), dim=1))
+    errors = th.stack(q_values) - targets
+    loss = (replay_data.weights * errors.square()).sum(dim=2).mean()
+    return loss, q_values[0][:, :1].detach(), errors[0].detach().abs().amax(dim=1)
 
 
 def reward_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, targets: th.Tensor) -> th.Tensor:

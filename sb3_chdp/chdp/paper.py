@@ -173,6 +173,7 @@ class PaperCHDP(CHDP):
     }
     uniform_fraction: ClassVar[float] = 0.0
     critics_train_codebook: ClassVar[bool] = False
+    knows_returns: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -235,7 +236,7 @@ class PaperCHDP(CHDP):
     def _make_hybrid_space(self, action_layout: str) -> HybridBox:
         radices = HybridActionSpec(self.action_space, action_layout).radices
         width = sum(block_widths(radices, self.latent_dim))
-        return HybridBox(self.action_space, action_layout, width, self._mask_parts())
+        return HybridBox(self.action_space, action_layout, width, self._state_parts())
 
     def _latents(self, replay_data: HybridReplaySamples) -> th.Tensor:
         return replay_data.latents

@@ -13,13 +13,13 @@ from torch import nn
 from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.candidates import FixedDraws, Selection
 from sb3_chdp.chdp.codebook import Codebook
-from sb3_chdp.chdp.critic import AttentionReads, HybridCritic, QNetwork
+from sb3_chdp.chdp.critic import N_RETURN_FEATURES, AttentionReads, HybridCritic, QNetwork
 from sb3_chdp.chdp.diffusion import DiffusionModel
 from sb3_chdp.chdp.product_codebook import ProductCodebook
 from sb3_chdp.chdp.repeatable_noise import repeatable_noise
 from sb3_chdp.chdp.value_scale import ValueScale
 from sb3_chdp.common.hybrid_box import HybridBox
-from sb3_chdp.common.normalization import NormalizedCombinedExtractor, NormalizedExtractor
+from sb3_chdp.common.normalization import NormalizedCombinedExtractor, NormalizedExtractor, RunningNormalization
 from sb3_chdp.common.policies import CnnFeatures, HybridPolicy
 from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.common.utils import default_optimizer_kwargs
@@ -128,13 +128,23 @@ class CHDPPolicy(HybridPolicy):
         self.register_buffer("fixed_parameters", parameters, persistent=False)
 
     def _make_critic(self, extractor: BaseFeaturesExtractor, latent_dim: int) -> HybridCritic:
-        n_parameters = self.action_space.spec.max_parameters
+        n_parameters, n_features = self.action_space.spec.max_parameters, extractor.features_dim
         critic_arch = get_actor_critic_arch(self.net_arch)[1]
+        knows_returns = "returns" in self.action_space.columns
+        n_inputs = n_features + (N_RETURN_FEATURES if knows_returns else 0)
         q1, q2, rewards = (
-            QNetwork(extractor.features_dim, latent_dim, n_parameters, critic_arch, self.activation_fn, self.n_reads)
-            for _ in range(3)
+            QNetwork(n, latent_dim, n_parameters, critic_arch, self.activation_fn, self.n_reads)
+            for n in (n_inputs, n_inputs, n_features)
         )
-        return HybridCritic(self.observation_space, self.action_space, extractor, [q1, q2], rewards, self.normalize_images)
+        return HybridCritic(
+            self.observation_space,
+            self.action_space,
+            extractor,
+            [q1, q2],
+            RunningNormalization(1) if knows_returns else None,
+            rewards,
+            self.normalize_images,
+        )
 
     def _make_actor(self, features_dim: int, codebook: Codebook | ProductCodebook) -> CooperativeActor:
         latent_dim, n_parameters = codebook.latent_dim, self.action_space.spec.max_parameters

@@ -6,11 +6,13 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
-from sb3_chdp.common.rows import BITS, RowLayout
+from sb3_chdp.common.rows import BITS, MASK_PARTS, RowLayout
 from sb3_chdp.common.spaces import HybridActionSpec
 
 # Score of allowed discrete actions at least; that of others is -1
 LOWEST_ALLOWED = -0.999
+# SB3 wants bounds that are finite
+LARGEST = np.finfo(np.float32).max
 
 
 class HybridBox(spaces.Box):
@@ -20,28 +22,32 @@ class HybridBox(spaces.Box):
     :param native: the user's action space
     :param layout: see :class:`HybridActionSpec`
     :param latent_dim: width of what an algorithm stores behind the parameters
-    :param mask_parts: which masks the rows hold, of ``MASK_PARTS``
+    :param state_parts: what else the rows hold, of ``MASK_PARTS`` and ``RETURN_PARTS``
     """
 
-    def __init__(self, native: spaces.Space[Any], layout: str = "auto", latent_dim: int = 0, mask_parts: tuple[str, ...] = ()):
+    def __init__(
+        self, native: spaces.Space[Any], layout: str = "auto", latent_dim: int = 0, state_parts: tuple[str, ...] = ()
+    ):
         self.native = native
         self.spec = HybridActionSpec(native, layout)
         self.latent_dim = latent_dim
-        self.mask_parts = tuple(mask_parts)
+        self.state_parts = tuple(state_parts)
         radices = self.spec.radices
-        self.columns = RowLayout(radices, **self._widths(), **dict.fromkeys(self.mask_parts, -(-sum(radices) // BITS)))
+        mask_width = -(-sum(radices) // BITS)
+        widths = {part: mask_width if part in MASK_PARTS else 1 for part in self.state_parts}
+        self.columns = RowLayout(radices, **self._widths(), **widths)
         high = np.ones(self.columns.width, dtype=np.float32)
         low = -high
         if "discrete_actions" in self.columns:
             self.columns.view(low, "discrete_actions")[:] = 0
             self.columns.view(high, "discrete_actions")[:] = np.array(self.spec.radices) - 1
-        for part in self.mask_parts:
-            self.columns.view(low, part)[:] = 0
-            self.columns.view(high, part)[:] = 2**BITS - 1
+        for part in self.state_parts:
+            bounds = (0, 2**BITS - 1) if part in MASK_PARTS else (-LARGEST, LARGEST)
+            self.columns.view(low, part)[:], self.columns.view(high, part)[:] = bounds
         super().__init__(low, high, dtype=np.float32)
 
     def _widths(self) -> dict[str, int]:
-        """:return: columns of a row by name, without masks"""
+        """:return: columns of an action by name"""
         return dict(discrete_actions=len(self.spec.radices), parameters=self.spec.max_parameters, latents=self.latent_dim)
 
     def to_native(self, rows: np.ndarray) -> list[Any]:
@@ -91,7 +97,7 @@ class HybridBox(spaces.Box):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The tables of the spec follow from the native space
-        arguments = (self.native, self.spec.layout, self.latent_dim, self.mask_parts)
+        arguments = (self.native, self.spec.layout, self.latent_dim, self.state_parts)
         return type(self), arguments, {"_np_random": self._np_random}
 
 
@@ -102,11 +108,11 @@ class ConcatenatedBox(HybridBox):
 
     :param native: the user's action space
     :param layout: see :class:`HybridActionSpec`
-    :param mask_parts: see :class:`HybridBox`
+    :param state_parts: see :class:`HybridBox`
     """
 
-    def __init__(self, native: spaces.Space[Any], layout: str = "auto", mask_parts: tuple[str, ...] = ()):
-        super().__init__(native, layout, mask_parts=mask_parts)
+    def __init__(self, native: spaces.Space[Any], layout: str = "auto", state_parts: tuple[str, ...] = ()):
+        super().__init__(native, layout, state_parts=state_parts)
 
     def _widths(self) -> dict[str, int]:
         return dict(discrete_actions=len(self.spec.radices), parameters=self.spec.n_parameters)
@@ -122,7 +128,7 @@ class ConcatenatedBox(HybridBox):
         return self.columns.pack(discrete_actions=choices, parameters=parameters).astype(np.float32)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.native, self.spec.layout, self.mask_parts), {"_np_random": self._np_random}
+        return type(self), (self.native, self.spec.layout, self.state_parts), {"_np_random": self._np_random}
 
 
 class ScoreBox(ConcatenatedBox):

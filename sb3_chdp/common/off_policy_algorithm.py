@@ -19,8 +19,8 @@ from sb3_chdp.common.arguments import FRACTION, SWITCH, TRAIN_FREQ, Accepted, ch
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.buffer_file import check_buffer, load_buffer, save_buffer
 from sb3_chdp.common.checks import check_numbers
-from sb3_chdp.common.masked_n_step import MaskedNStepReplayBuffer
 from sb3_chdp.common.masks import INFO_KEY, read_masks
+from sb3_chdp.common.n_step_buffer import HybridNStepReplayBuffer
 from sb3_chdp.common.policies import HybridPolicy
 from sb3_chdp.common.rows import MASK_PARTS, pack_bits
 from sb3_chdp.common.safe_zip import refuse
@@ -117,13 +117,14 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         try:
             with warnings.catch_warnings():
                 self.replay_buffer_kwargs = dict(self.replay_buffer_kwargs)
-                if self.use_masking and self.n_steps > 1 and self.replay_buffer_class is None and not has_dicts:
+                about_states = bool(self._state_parts())
+                if about_states and self.n_steps != 1 and self.replay_buffer_class is None and not has_dicts:
                     # In place of SB3's, which it would choose; its warning that n_steps does not count is wrong here
                     warnings.filterwarnings("ignore", message="`n_steps=")
-                    self.replay_buffer_class = MaskedNStepReplayBuffer
+                    self.replay_buffer_class = HybridNStepReplayBuffer
                     self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": self.n_steps, "gamma": self.gamma}
-                elif self.use_masking and self.replay_buffer_class is NStepReplayBuffer:
-                    self.replay_buffer_class = MaskedNStepReplayBuffer
+                elif about_states and self.replay_buffer_class is NStepReplayBuffer:
+                    self.replay_buffer_class = HybridNStepReplayBuffer
                 super()._setup_model()
         except MemoryError as error:
             raise ValueError(
@@ -310,8 +311,8 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         super()._on_step()
         self.logger.record("rollout/exploration_rate", self._exploration_rate())
 
-    def _mask_parts(self) -> tuple[str, ...]:
-        """:return: the masks that rows hold"""
+    def _state_parts(self) -> tuple[str, ...]:
+        """:return: what rows hold about the states before and after an action"""
         return MASK_PARTS if self.use_masking else ()
 
     def _sample_batch(self, batch_size: int) -> HybridReplaySamples:

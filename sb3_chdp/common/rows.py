@@ -10,8 +10,8 @@ Array = TypeVar("Array", np.ndarray, th.Tensor)
 
 # Booleans that a float32 column holds; it counts up to 2^24 without a gap
 BITS = 16
-# Parts that hold masks; they come last
-MASK_PARTS = ("masks", "next_masks")
+# What is known of the states before and after an action; these parts come last
+MASK_PARTS, RETURN_PARTS = ("masks", "next_masks"), ("returns", "next_returns")
 
 
 class RowLayout:
@@ -20,7 +20,8 @@ class RowLayout:
 
     Names in use: ``discrete_actions`` (a column per choice, with the index of the value) or ``scores`` (a column per value, of
     which the highest of each choice decides), ``parameters`` (scaled to [-1, 1]), ``latents``, ``masks`` and ``next_masks``
-    (which values were allowed in the state and in the next one, 16 of them in a column).
+    (which values were allowed in the state and in the next one, 16 of them in a column), ``returns`` and ``next_returns``
+    (the sum of the episode's rewards before the action, and with its reward).
 
     :param radices: numbers of values of the choices that an action makes
     :param widths: number of columns by name
@@ -32,8 +33,8 @@ class RowLayout:
         ends = np.cumsum([0, *widths.values()]).tolist()
         self._slices = {name: slice(*ends[i : i + 2]) for i, name in enumerate(widths)}
         self.width: int = ends[-1]
-        #: number of columns without masks
-        self.action_width: int = self.width - sum(widths.get(name, 0) for name in MASK_PARTS)
+        #: number of columns that the action needs
+        self.action_width: int = self.width - sum(widths.get(name, 0) for name in MASK_PARTS + RETURN_PARTS)
 
     def __contains__(self, name: str) -> bool:
         return name in self._slices

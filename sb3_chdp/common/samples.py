@@ -7,17 +7,19 @@ from stable_baselines3.common.type_aliases import PyTorchObs, ReplayBufferSample
 
 from sb3_chdp.common.buffers import Index, PrioritizedReplayBufferSamples
 from sb3_chdp.common.hybrid_box import HybridBox
+from sb3_chdp.common.rows import MASK_PARTS
 
 
 class HybridReplaySamples(NamedTuple):
     """
     A batch with the columns of its action rows named.
 
-    Shapes: actions (B, columns), the rows without masks; of these discrete_actions (B,) int64, parameters (B, Pmax) in
-    [-1, 1] with padding 0, or (B, P) those of all actions, latents (B, latent_dim), which may be 0 columns; rewards, dones,
-    discounts and weights (B, 1); indices say where a prioritised buffer stores them; masks and next_masks (B, K) boolean,
-    which discrete actions the environment allowed in the state and in the next one, None without masking. In a factored
-    space discrete_actions are (B, L) and masks (B, sum of the radices).
+    Shapes: actions (B, columns), the rows without masks and returns; of these discrete_actions (B,) int64, parameters
+    (B, Pmax) in [-1, 1] with padding 0, or (B, P) those of all actions, latents (B, latent_dim), which may be 0 columns;
+    rewards, dones, discounts and weights (B, 1); indices say where a prioritised buffer stores them; masks and next_masks
+    (B, K) boolean, which discrete actions the environment allowed in the state and in the next one, None without masking;
+    returns and next_returns (B, 1), the sum of the episode's rewards before the action and with its reward, None if rows hold
+    none. In a factored space discrete_actions are (B, L) and masks (B, sum of the radices).
     """
 
     observations: PyTorchObs
@@ -33,6 +35,8 @@ class HybridReplaySamples(NamedTuple):
     indices: Index | None = None
     masks: th.Tensor | None = None
     next_masks: th.Tensor | None = None
+    returns: th.Tensor | None = None
+    next_returns: th.Tensor | None = None
 
 
 def name_columns(
@@ -56,5 +60,8 @@ def name_columns(
         discounts=gamma if replay_data.discounts is None else replay_data.discounts,
         weights=getattr(replay_data, "weights", 1.0),
         indices=getattr(replay_data, "indices", None),
-        **{name: columns.masks(rows, name) for name in action_space.mask_parts},
+        **{
+            name: columns.masks(rows, name) if name in MASK_PARTS else columns.view(rows, name)
+            for name in action_space.state_parts
+        },
     )

@@ -66,7 +66,7 @@ class HybridTD3Policy(HybridPolicy, TD3Policy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         # Masks are no outputs of actors and no inputs to critics
-        if isinstance(self.action_space, ScoreBox) and self.action_space.mask_parts:
+        if isinstance(self.action_space, ScoreBox) and "masks" in self.action_space.columns:
             bare = type(self.action_space)(self.action_space.native, self.action_space.spec.layout)
             self.actor_kwargs["action_space"] = self.critic_kwargs["action_space"] = bare
         super()._build(lr_schedule)
@@ -244,7 +244,7 @@ class HybridTD3(HybridOffPolicyAlgorithm):
             self._setup_model()
 
     def _make_hybrid_space(self, action_layout: str) -> HybridBox:
-        return ScoreBox(self.action_space, action_layout, self._mask_parts())
+        return ScoreBox(self.action_space, action_layout, self._state_parts())
 
     def _network_kwargs(self) -> dict[str, Any]:
         return {"inverting_gradients": self.inverting_gradients}

@@ -125,7 +125,7 @@ class HyARTD3(HybridTD3):
     def _make_hybrid_space(self, action_layout: str) -> HybridBox:
         radices = HybridActionSpec(self.action_space, action_layout).radices
         latent_dim = sum(block_widths(radices, self.embedding_dim)) + self.parameter_latent_dim
-        return HybridBox(self.action_space, action_layout, latent_dim, self._mask_parts())
+        return HybridBox(self.action_space, action_layout, latent_dim, self._state_parts())
 
     def _network_kwargs(self) -> dict[str, Any]:
         return {**super()._network_kwargs(), "embedding_dim": self.embedding_dim}

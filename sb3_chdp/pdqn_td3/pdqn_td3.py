@@ -102,7 +102,7 @@ class PDQNTD3(HybridTD3):
             self._setup_model()
 
     def _make_hybrid_space(self, action_layout: str) -> HybridBox:
-        return ConcatenatedBox(self.action_space, action_layout, self._mask_parts())
+        return ConcatenatedBox(self.action_space, action_layout, self._state_parts())
 
     def _network_kwargs(self) -> dict[str, Any]:
         return {**super()._network_kwargs(), "multi_pass": self.multi_pass, "passthrough": self.passthrough}

@@ -1,4 +1,4 @@
-"""n-step returns with the masks of the states that they end in."""
+"""n-step returns with what is known of the states that they end in."""
 
 import numpy as np
 from stable_baselines3.common.buffers import NStepReplayBuffer
@@ -8,9 +8,10 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_chdp.common.hybrid_box import HybridBox
 
 
-class MaskedNStepReplayBuffer(NStepReplayBuffer):
+class HybridNStepReplayBuffer(NStepReplayBuffer):
     """
-    SB3's n-step replay buffer for rows with ``next_masks``, which in its samples are those of the last of the n steps.
+    SB3's n-step replay buffer for rows with ``next_masks`` or ``next_returns``, which in its samples are those of the last of
+    the n steps.
 
     The arguments are those of :class:`stable_baselines3.common.buffers.NStepReplayBuffer`.
     """
@@ -30,6 +31,8 @@ class MaskedNStepReplayBuffer(NStepReplayBuffer):
         ends |= steps == (self.pos - 1) % self.buffer_size
         ends[:, -1] = True
         last = steps[np.arange(len(steps)), ends.argmax(axis=1)]
-        next_masks = self.action_space.columns.view(self.actions[last, env_indices], "next_masks")
-        self.action_space.columns.view(samples.actions, "next_masks")[:] = self.to_torch(next_masks)
+        columns, last_rows = self.action_space.columns, self.to_torch(self.actions[last, env_indices])
+        for name in self.action_space.state_parts:
+            if name.startswith("next_"):
+                columns.view(samples.actions, name)[:] = columns.view(last_rows, name)
         return samples
