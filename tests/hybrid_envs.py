@@ -198,3 +198,18 @@ class HybridChainEnv(gym.Env):
         self.t += 1
         done = self.t == len(self.STEPS)
         return self._obs(), self.worth if done else 0.0, done, False, {}
+
+
+class GoalEnv(LayoutEnv):
+    """What ``HerReplayBuffer`` needs."""
+
+    def __init__(self):
+        parts: dict[str, spaces.Space] = dict.fromkeys(("observation", "achieved_goal", "desired_goal"), box(-1, 1, 2))
+        super().__init__(layouts()["shared"], spaces.Dict(parts))
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return -np.abs(achieved_goal - desired_goal).sum(axis=-1)
+
+    def step(self, action):
+        obs, _, *rest = super().step(action)
+        return obs, float(self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {})), *rest

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chdp import CHDP, FlattenHybridAction, ScalarBoxes, check_hybrid_env
-from tests.hybrid_envs import LayoutEnv, MaskedEnv, box, layouts, make_layout_env
+from tests.hybrid_envs import GoalEnv, LayoutEnv, MaskedEnv, box, layouts, make_layout_env
 
 ACTIONS: Any = layouts()["shared"]
 PLANE = box(-1, 1, 2)
@@ -307,21 +307,6 @@ def test_flattening_mends_nested_observations():
     )
     check_hybrid_env(env, warn=False)
     CHDP("MlpPolicy", env, learning_starts=5, n_diffusion_steps=2, batch_size=4).learn(10)
-
-
-class GoalEnv(LayoutEnv):
-    """What HerReplayBuffer needs."""
-
-    def __init__(self):
-        parts: dict[str, spaces.Space] = dict.fromkeys(("observation", "achieved_goal", "desired_goal"), box(-1, 1, 2))
-        super().__init__(layouts()["shared"], spaces.Dict(parts))
-
-    def compute_reward(self, achieved_goal, desired_goal, info):
-        return -np.abs(achieved_goal - desired_goal).sum(axis=-1)
-
-    def step(self, action):
-        obs, _, *rest = super().step(action)
-        return obs, float(self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {})), *rest
 
 
 def test_an_environment_with_goals():

@@ -82,13 +82,13 @@ def check(model, tmp_path, n=N):
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_algorithm(name, tmp_path):
     # Others decide the same everywhere before they are trained
-    seed = 2 if name == "CHDP" else 1
+    seed = 8 if name == "CHDP" else 1
     check(getattr(sb3_chdp, name)("MlpPolicy", make_layout_env("flat"), seed=seed), tmp_path)
 
 
 @pytest.mark.slow
 def test_rewards_that_count_for_more(tmp_path):
-    model = sb3_chdp.CHDP("MlpPolicy", make_layout_env("flat"), seed=2)
+    model = sb3_chdp.CHDP("MlpPolicy", make_layout_env("flat"), seed=8)
     model.policy.set_foresight(0.5)
     check(model, tmp_path, n=50)
 

@@ -1,16 +1,20 @@
 """What episodes have returned before an action: rows hold it, and critics that value next states know it."""
 
+from functools import partial
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.her import HerReplayBuffer
 
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import PaperCHDP, losses
 from tests.algorithms import calls_of, filled_model, sample
-from tests.hybrid_envs import LayoutEnv, layouts
+from tests.hybrid_envs import GoalEnv, LayoutEnv, layouts
 
 ADVANCE, FINISH = 0, 1
 BONUS, PRIZE = 10.0, 8.0
@@ -62,8 +66,8 @@ class Unaware(CHDP):
 
 
 def test_a_bonus_that_is_paid_once_does_not_look_as_if_it_came_again():
-    """Going back is worth 0.95 of the prize, and 4 times as much to critics that average over episodes with the bonus paid."""
-    assert advantage_of_going_back(CHDP, seed=1) < 5 < 15 < advantage_of_going_back(Unaware, seed=1)
+    """Two steps later the prize is worth 0.95^2 of it. Critics that are not told say 4 times as much."""
+    assert advantage_of_going_back(CHDP, seed=1) < 1 < 15 < advantage_of_going_back(Unaware, seed=1)
 
 
 class Counting(LayoutEnv):
@@ -74,28 +78,40 @@ class Counting(LayoutEnv):
         return obs, float(self.t), terminated, truncated, info
 
 
-def counting_env(n_envs):
-    return DummyVecEnv([lambda: Counting(layouts()["shared"], episode_length=4)] * n_envs)
+def counting_env(*lengths):
+    return DummyVecEnv([partial(Counting, layouts()["shared"], episode_length=n) for n in lengths])
 
 
 @pytest.mark.parametrize("wrapper", [lambda env: env, VecNormalize])
 def test_rows_hold_returns(wrapper):
     """Those of the episode so far, as the environment gave the rewards."""
-    model = filled_model(wrapper(counting_env(2)), n_transitions=20)
+    model = filled_model(wrapper(counting_env(4, 3)), n_transitions=20)
     rows, columns = model.replay_buffer.actions[:10], model.hybrid_space.columns
-    for env in range(2):
-        assert columns.view(rows[:, env], "returns")[:, 0].tolist() == [0, 1, 3, 6, 0, 1, 3, 6, 0, 1]
-        assert columns.view(rows[:, env], "next_returns")[:, 0].tolist() == [1, 3, 6, 10, 1, 3, 6, 10, 1, 3]
+    assert columns.view(rows, "returns")[..., 0].T.tolist() == [[0, 1, 3, 6, 0, 1, 3, 6, 0, 1], [0, 1, 3, 0, 1, 3, 0, 1, 3, 0]]
+    then = [[1, 3, 6, 10, 1, 3, 6, 10, 1, 3], [1, 3, 6, 1, 3, 6, 1, 3, 6, 1]]
+    assert columns.view(rows, "next_returns")[..., 0].T.tolist() == then
+
+
+def test_training_that_a_callback_stopped_begins_with_a_new_episode():
+    model = filled_model(counting_env(4), n_transitions=1)
+    model.learn(100, callback=StopTrainingOnMaxEpisodes(2))
+    pos = model.replay_buffer.pos
+    model.learn(4, reset_num_timesteps=False)
+    returns = model.hybrid_space.columns.view(model.replay_buffer.actions[pos : pos + 4, 0], "returns")
+    assert returns[:, 0].tolist() == [0, 1, 3, 6]
+
+
+def test_hindsight_has_no_returns():
+    model = CHDP("MultiInputPolicy", GoalEnv(), replay_buffer_class=HerReplayBuffer, buffer_size=100)
+    assert "returns" not in model.hybrid_space.columns and model.critic.return_normalization is None
 
 
 def test_returns_after_n_steps():
-    model = filled_model(counting_env(1), n_transitions=40, n_steps=3)
-    data = sample(model, 64)
-    # After three steps, or where the episode ends
-    after = {0: 6, 1: 10, 3: 10, 6: 10}
-    newest = {6: 10, 3: 10, 1: 3 + 3}
-    for before, then in zip(data.returns[:, 0].tolist(), data.next_returns[:, 0].tolist(), strict=True):
-        assert then in (after[before], newest.get(before))
+    """Those after the last of them, or where the episode ends."""
+    model = filled_model(counting_env(4, 2), n_transitions=80, n_steps=3)
+    data = sample(model, 200)
+    pairs = set(zip(data.returns[:, 0].tolist(), data.next_returns[:, 0].tolist(), strict=True))
+    assert pairs == {(0, 6), (1, 10), (3, 10), (6, 10), (0, 3), (1, 3)}
 
 
 def test_next_values_know_returns_and_actions_do_not():

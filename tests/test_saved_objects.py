@@ -4,7 +4,6 @@ import io
 import json
 from collections import OrderedDict
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -20,7 +19,7 @@ from sb3_chdp import CHDP, HPPO, PATD3
 from sb3_chdp.common.buffers import PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
 from sb3_chdp.common.serialization import decode, encode
 from tests.algorithms import make_model
-from tests.hybrid_envs import make_layout_env
+from tests.hybrid_envs import GoalEnv, make_layout_env
 from tests.saved_files import same_predictions, saved_model
 
 ORDERED = OrderedDict(z=spaces.Discrete(2), a=spaces.Box(0, 1, (1,)))
@@ -151,27 +150,6 @@ def test_replay_buffers(kwargs, observations, tmp_path):
         for a, b in zip(*((part.values() if isinstance(part, dict) else [part]) for part in (mine, theirs)), strict=True):
             np.testing.assert_array_equal(a, b)
     other.learn(20, reset_num_timesteps=False)
-
-
-class GoalEnv(gym.Env):
-    """The first parameter is to be the desired goal."""
-
-    observation_space = spaces.Dict({key: spaces.Box(-1, 1, (1,)) for key in ("observation", "achieved_goal", "desired_goal")})
-    action_space = spaces.Tuple((spaces.Discrete(2), spaces.Box(-1, 1, (1,))))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t, self.obs = 0, {key: np.zeros(1, np.float32) for key in self.observation_space}
-        return self.obs, {}
-
-    def step(self, action):
-        self.t += 1
-        self.obs = {**self.obs, "achieved_goal": action[1]}
-        reward = self.compute_reward(action[1], self.obs["desired_goal"], {})
-        return self.obs, float(reward), False, self.t >= 5, {}
-
-    def compute_reward(self, achieved_goal, desired_goal, info):
-        return -np.abs(achieved_goal - desired_goal).sum(axis=-1)
 
 
 def test_hindsight_replay_buffer(tmp_path):

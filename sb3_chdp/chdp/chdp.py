@@ -48,7 +48,7 @@ class CHDP(ExploringAlgorithm):
         2. critics have layer normalisation, a state value of their own and read parts of the state, see :class:`QNetwork`;
         3. the critics' loss trains the codebook too, so that actions of similar effect get similar codewords; these are what
            critics see of a discrete action, not the latents around them that decode to it, see :class:`CooperativeActor`;
-        4. the values of next states know what the episode has returned so far, see :class:`HybridCritic`;
+        4. critics that value next states are told what the episode has returned so far, see :class:`HybridCritic`;
         5. of several actions the one that critics value most acts, and is the next action in targets; while training, those
            that they disagree about are tried, see :class:`Selection`;
         6. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the

@@ -7,6 +7,7 @@ import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.her import HerReplayBuffer
 
 from sb3_chdp.chdp.exploration import ReturnSums, exploration_rate, informative_steps
 from sb3_chdp.chdp.foresight import Claims, ForesightSums, explore
@@ -33,7 +34,7 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
     """
 
     policy: CHDPPolicy
-    # Whether rows hold what episodes have returned, which targets then know
+    # Whether rows hold what episodes have returned, which critics are then told in targets
     knows_returns: ClassVar[bool] = True
 
     def __init__(self, *args: Any, **kwargs: Any):
@@ -62,7 +63,10 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _state_parts(self) -> tuple[str, ...]:
-        return (*super()._state_parts(), *(RETURN_PARTS if self.knows_returns else ()))
+        kind = self.replay_buffer_class
+        # Hindsight has other rewards than the episode had
+        has_hindsight = isinstance(kind, type) and issubclass(kind, HerReplayBuffer)
+        return (*super()._state_parts(), *(RETURN_PARTS if self.knows_returns and not has_hindsight else ()))
 
     def _exploration_rate(self) -> float:
         n_values = sum(self.hybrid_space.spec.radices)
@@ -92,7 +96,7 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         own = rewards if self._vec_normalize_env is None else self._vec_normalize_env.get_original_reward()
         before = self.returns_so_far if len(self.returns_so_far) == self.n_envs else [0.0] * self.n_envs
         self.returns_so_far = [value + reward for value, reward in zip(before, own.tolist(), strict=True)]
-        if self.knows_returns:
+        if "returns" in self.hybrid_space.columns:
             for name, values in zip(RETURN_PARTS, (before, self.returns_so_far), strict=True):
                 self.hybrid_space.columns.view(rows, name)[:, 0] = values
 

@@ -20,7 +20,7 @@ def next_values(
     :param policy: the networks
     :param observations: (B, ...) next observations
     :param masks: (B, K) False for discrete actions that may not be taken, None if all may
-    :param returns: (B, 1) what episodes have returned, which the policies do not know; None: the critics do not either
+    :param returns: (B, 1) what episodes have returned, which the policies are not told; None: nor are the critics
     :return: (B, 1) values in the units of the rewards, with all that follows
     """
     features = policy.critic_target.features(observations)
@@ -48,8 +48,8 @@ def critic_loss(
     policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, targets: th.Tensor
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """
-    Eq. 10, (Q_j(s, e, a) - y)^2, weighted if the replay is prioritised; half of it for critics that know what the episode has
-    returned, half for critics that do not, if rows tell.
+    Eq. 10, (Q_j(s, e, a) - y)^2, weighted if the replay is prioritised; half of it for critics that are told what the
+    episode has returned, if rows hold it, half for critics that are not.
 
     It has a gradient for the codebook, which may be used.
 

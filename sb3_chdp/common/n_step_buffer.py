@@ -11,7 +11,7 @@ from sb3_chdp.common.hybrid_box import HybridBox
 class HybridNStepReplayBuffer(NStepReplayBuffer):
     """
     SB3's n-step replay buffer for rows with ``next_masks`` or ``next_returns``, which in its samples are those of the last of
-    the n steps.
+    the n steps. n-step buffers of one's own have to derive from it.
 
     The arguments are those of :class:`stable_baselines3.common.buffers.NStepReplayBuffer`.
     """

@@ -117,13 +117,13 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         try:
             with warnings.catch_warnings():
                 self.replay_buffer_kwargs = dict(self.replay_buffer_kwargs)
-                about_states = bool(self._state_parts())
-                if about_states and self.n_steps != 1 and self.replay_buffer_class is None and not has_dicts:
+                tells_next = bool(self._state_parts())
+                if tells_next and self.n_steps != 1 and self.replay_buffer_class is None and not has_dicts:
                     # In place of SB3's, which it would choose; its warning that n_steps does not count is wrong here
                     warnings.filterwarnings("ignore", message="`n_steps=")
                     self.replay_buffer_class = HybridNStepReplayBuffer
                     self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": self.n_steps, "gamma": self.gamma}
-                elif about_states and self.replay_buffer_class is NStepReplayBuffer:
+                elif tells_next and self.replay_buffer_class is NStepReplayBuffer:
                     self.replay_buffer_class = HybridNStepReplayBuffer
                 super()._setup_model()
         except MemoryError as error:
@@ -210,7 +210,11 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
 
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
         """SB3's ``collect_rollouts``, in which actions are rows."""
-        return super().collect_rollouts(self.native_env(env), *args, **kwargs)
+        rollout = super().collect_rollouts(self.native_env(env), *args, **kwargs)
+        if not rollout.continue_training:
+            # The last step was not stored: what follows would not be what came of the action before
+            self._last_obs = None
+        return rollout
 
     def _sample_action(
         self,
