@@ -172,7 +172,7 @@ def test_next_values_are_whole_without_foresight():
     th.manual_seed(0)
     latents, _, parameters = policy.select_target(policy.actor_target, model.critic, features)
     policy.set_foresight(1.0)
-    q_values = th.min(*model.critic_target.q_values(features, latents, parameters, data.next_returns))
+    q_values = th.min(*model.critic_target.q_values(features, latents, parameters))
     th.testing.assert_close(targets[:, :1], data.rewards + 0.9 * policy.value_scale.values(q_values))
 
 
@@ -180,7 +180,7 @@ def test_next_values_are_whole_without_foresight():
 def test_critic_loss(algorithm_class):
     """The sum of both squared errors, weighted; priorities follow the larger error of both critics."""
     model = filled_model(algorithm_class=algorithm_class)
-    data, targets = sample(model)._replace(returns=None), th.randn(32, 1)
+    data, targets = sample(model), th.randn(32, 1)
     features = model.critic.features(data.observations)
     q1, q2 = model.critic.q_values(features, data.latents, data.parameters)
     loss, values, errors = losses.critic_loss(model.policy, data._replace(weights=1.0), features, targets)

@@ -148,7 +148,7 @@ def test_logged_values():
     logged = model.logger.name_to_value
     names = {name.removeprefix("train/") for name in logged if name.startswith("train/")}
     assert names >= {
-        "critic_loss", "reward_loss", "discrete_loss", "continuous_loss", "diffusion_loss_discrete",
+        "critic_loss", "reward_loss", "return_loss", "discrete_loss", "continuous_loss", "diffusion_loss_discrete",
         "diffusion_loss_continuous", "q_mean", "codebook_usage", "codebook_perplexity", "learning_rate",
         "codebook_learning_rate", "n_updates",
     }  # fmt: skip

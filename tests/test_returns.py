@@ -1,4 +1,4 @@
-"""What episodes have returned before an action: rows hold it, and critics that value next states know it."""
+"""What episodes have returned before an action: rows hold it, and the values of next states depend on it."""
 
 from functools import partial
 
@@ -60,14 +60,14 @@ def advantage_of_going_back(algorithm_class, seed):
 
 
 class Unaware(CHDP):
-    """CHDP whose critics are not told."""
+    """CHDP whose targets do not know returns."""
 
     knows_returns = False
 
 
 def test_a_bonus_that_is_paid_once_does_not_look_as_if_it_came_again():
-    """Two steps later the prize is worth 0.95^2 of it. Critics that are not told say 4 times as much."""
-    assert advantage_of_going_back(CHDP, seed=1) < 1 < 15 < advantage_of_going_back(Unaware, seed=1)
+    """Two steps later the prize is worth 0.95^2 of it. Critics that do not know returns say 4 times as much."""
+    assert advantage_of_going_back(CHDP, seed=1) < 5 < 15 < advantage_of_going_back(Unaware, seed=1)
 
 
 class Counting(LayoutEnv):
@@ -103,7 +103,7 @@ def test_training_that_a_callback_stopped_begins_with_a_new_episode():
 
 def test_hindsight_has_no_returns():
     model = CHDP("MultiInputPolicy", GoalEnv(), replay_buffer_class=HerReplayBuffer, buffer_size=100)
-    assert "returns" not in model.hybrid_space.columns and model.critic.return_normalization is None
+    assert "returns" not in model.hybrid_space.columns and model.critic.return_network is None
 
 
 def test_returns_after_n_steps():
@@ -115,32 +115,47 @@ def test_returns_after_n_steps():
 
 
 def test_next_values_know_returns_and_actions_do_not():
-    model = filled_model()
-    targets, values = (calls_of(critic.q_networks[0]) for critic in (model.critic_target, model.critic))
+    model = filled_model(counting_env(4))
     data = sample(model)
+    targets, losses_of = (calls_of(critic.return_network) for critic in (model.critic_target, model.critic))
     losses.target_values(model.policy, data)
-    (features, *_), *_ = targets
-    assert (features[:, -1] == 1).all() and len(features[:, -2].unique()) > 1
+    assert len(targets) == 1 and th.equal(targets[0][3], data.next_returns)
+    model.train(1, 32)
+    assert len(targets) == 2 and len(losses_of) == 1
     model.predict(data.observations.numpy())
-    # What chooses next actions, and what acts
-    assert all((features[:, -2:] == 0).all() for features, *_ in [*values, *targets[1:]])
-    losses.critic_loss(model.policy, data, model.critic.features(data.observations), th.zeros(len(data.rewards), 1))
-    assert [features[:, -1].mean().item() for features, *_ in values[-2:]] == [0, 1]
+    assert len(targets) == 2 and len(losses_of) == 1
 
 
-def test_half_of_the_critic_loss_is_of_critics_that_know_returns():
-    model = filled_model()
+def test_what_returns_add():
+    """To the value of the next state, the smaller one of both critics."""
+    model = filled_model(counting_env(4))
+    data, policy = sample(model)._replace(dones=0.0, discounts=1.0), model.policy
+    policy.in_units_of_critics(th.randn(32, 2))
+    th.manual_seed(0)
+    before = losses.target_values(policy, data)
+    # Nothing yet
+    th.manual_seed(0)
+    th.testing.assert_close(before, losses.target_values(policy, data._replace(next_returns=None)))
+    model.critic_target.return_network.forward = lambda features, latents, parameters, returns: returns
+    th.manual_seed(0)
+    added = losses.target_values(policy, data)[:, 0] - before[:, 0]
+    th.testing.assert_close(added, policy.value_scale.scale * data.next_returns[:, 0].double())
+
+
+def test_return_loss():
+    model = filled_model(counting_env(4))
+    data, errors = sample(model)._replace(weights=3.0), th.randn(32, 1)
+    features = model.critic.features(data.observations).detach()
+    with th.no_grad():
+        for parameter in model.critic.return_network.parameters():
+            parameter.add_(0.1)
     model.policy.set_training_mode(False)
-    data, targets = sample(model), th.randn(32, 1)
-    features = model.critic.features(data.observations)
-    both, q1, _ = losses.critic_loss(model.policy, data, features, targets)
-    unaware, q1_unaware, _ = losses.critic_loss(model.policy, data._replace(returns=None), features, targets)
-    q_values = th.cat(model.critic.q_values(features, data.latents, data.parameters, data.returns), dim=1)
-    th.testing.assert_close(both, (unaware + (q_values - targets).square().sum(dim=1).mean()) / 2)
-    th.testing.assert_close(q1, q1_unaware)
+    summands = model.critic.return_network(features, data.latents, data.parameters, data.returns)
+    loss = losses.return_loss(model.policy, data, features, errors)
+    th.testing.assert_close(loss, 3 * (summands - errors).square().mean())
 
 
 def test_the_paper_does_not_know_returns():
     model = filled_model(algorithm_class=PaperCHDP)
     assert "returns" not in model.hybrid_space.columns and sample(model).returns is None
-    assert model.critic.return_normalization is None
+    assert model.critic.return_network is None

@@ -16,6 +16,7 @@ from sb3_chdp.chdp.losses import (
     continuous_policy_loss,
     critic_loss,
     discrete_policy_loss,
+    return_loss,
     reward_loss,
     target_values,
 )
@@ -48,7 +49,7 @@ class CHDP(ExploringAlgorithm):
         2. critics have layer normalisation, a state value of their own and read parts of the state, see :class:`QNetwork`;
         3. the critics' loss trains the codebook too, so that actions of similar effect get similar codewords; these are what
            critics see of a discrete action, not the latents around them that decode to it, see :class:`CooperativeActor`;
-        4. critics that value next states are told what the episode has returned so far, see :class:`HybridCritic`;
+        4. the values of next states depend on what the episode has returned so far, see :class:`ReturnNetwork`;
         5. of several actions the one that critics value most acts, and is the next action in targets; while training, those
            that they disagree about are tried, see :class:`Selection`;
         6. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
@@ -237,11 +238,13 @@ class CHDP(ExploringAlgorithm):
                 self.replay_buffer.update_priorities(replay_data.indices, errors)
             losses = {"critic_loss": loss, "q_mean": policy.value_scale.values(q1).mean()}
             features = features.detach()
-            # The reward alone, for foresight; PaperCHDP has none
+            # The reward alone, for foresight, and what returns add to values, for targets; PaperCHDP has neither
             if policy.reward_optimizer is not None:
-                loss = reward_loss(policy, replay_data, features, targets[:, 1:])
+                loss = losses["reward_loss"] = reward_loss(policy, replay_data, features, targets[:, 1:])
+                if replay_data.returns is not None:
+                    losses["return_loss"] = return_loss(policy, replay_data, features, targets[:, :1] - q1)
+                    loss = loss + losses["return_loss"]
                 gradient_step(loss, [policy.reward_optimizer], self.max_grad_norm, "reward_loss")
-                losses["reward_loss"] = loss
 
             if self._n_updates % self.policy_delay == 0:
                 with th.no_grad():

@@ -8,14 +8,13 @@ from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
-from torch.nn import functional as F
+
+from sb3_chdp.common.normalization import RunningNormalization
 
 # Factor of the logits, which start small
 SHARPNESS = 3.0
 # Over fewer entries side by side, softmax on a processor takes several times as long as over entries further apart
 SLOW_SOFTMAX = 16
-# What an episode has returned, and whether that is known
-N_RETURN_FEATURES = 2
 
 
 class AttentionReads(nn.Module):
@@ -107,20 +106,46 @@ class QNetwork(nn.Module):
         bias.add_(summand)
 
 
+class ReturnNetwork(nn.Module):
+    """
+    What the return of the episode before an action adds to the action's value, nothing at first: targets may know more than
+    the policies do (as the critic of Pinto et al., 2017).
+
+    Rewards often depend on what observations do not show, a bonus that is paid once per episode, say. Q is an average over
+    both cases. In targets it makes going back look as if it earned the bonus once more.
+
+    :param features_dim: number of features of the state
+    :param args: further arguments of :class:`QNetwork`
+    """
+
+    def __init__(self, features_dim: int, *args: Any):
+        super().__init__()
+        self.normalization = RunningNormalization(1)
+        self.network = QNetwork(features_dim + 1, *args)
+        for parameter in (*self.network.value[-1].parameters(), *self.network.advantage[-1].parameters()):
+            nn.init.zeros_(parameter)
+
+    def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor, returns: th.Tensor) -> th.Tensor:
+        """
+        :param features: (B, features_dim)
+        :param latents: (B, latent_dim)
+        :param parameters: (B, n_parameters) scaled parameters
+        :param returns: (B, 1) sum of the episode's rewards before the action
+        :return: (B, 1) summands, in the units of the critics
+        """
+        return self.network(th.cat([features, self.normalization(returns)], dim=1), latents, parameters)
+
+
 class HybridCritic(BaseModel):
     """
     Twin critic Q(s, latent, parameters), with the features of the state computed once for several calls.
-
-    It may also be told what the episode has returned before the action (the critic knows more than the policies, as in Pinto
-    et al., 2017). Rewards often depend on what observations do not show: a bonus that is paid once per episode, say. Where the
-    value of a next state is an average over both cases, it looks as if going back earned the bonus once more.
 
     :param observation_space: observation space
     :param action_space: space of the action rows
     :param features_extractor: network to extract features
     :param q_networks: two networks of features, latents and parameters
-    :param return_normalization: of what the episode has returned; None: the networks cannot be told
     :param reward_network: such a network of the reward alone, for foresight below 1; None: foresight is always 1
+    :param return_network: what returns add to the values; None: nothing
     :param normalize_images: whether to divide images by 255
 
     :ivar foresight: weight in [0, 1] of what follows a reward in the choice of actions
@@ -128,8 +153,8 @@ class HybridCritic(BaseModel):
 
     features_extractor: BaseFeaturesExtractor
     optimizer: th.optim.Optimizer
-    return_normalization: nn.Module | None
     reward_network: nn.Module | None
+    return_network: ReturnNetwork | None
 
     def __init__(
         self,
@@ -137,47 +162,30 @@ class HybridCritic(BaseModel):
         action_space: spaces.Box,
         features_extractor: BaseFeaturesExtractor,
         q_networks: list[nn.Module],
-        return_normalization: nn.Module | None = None,
         reward_network: nn.Module | None = None,
+        return_network: ReturnNetwork | None = None,
         normalize_images: bool = True,
     ):
         super().__init__(
             observation_space, action_space, features_extractor=features_extractor, normalize_images=normalize_images
         )
         self.q_networks = nn.ModuleList(q_networks)
-        self.return_normalization = return_normalization
         self.reward_network = reward_network
+        self.return_network = return_network
         self.foresight = 1.0
 
     def features(self, obs: PyTorchObs) -> th.Tensor:
         """:return: (B, features_dim) features of the observations"""
         return self.extract_features(obs, self.features_extractor)
 
-    def with_returns(self, features: th.Tensor, returns: th.Tensor | None) -> th.Tensor:
-        """
-        :param features: (B, features_dim) from :meth:`features`
-        :param returns: (B, 1) what episodes have returned, in their own units; None: not known
-        :return: (B, n) inputs of the networks: the features, normalised returns and whether they are known
-        """
-        if self.return_normalization is None:
-            return features
-        if returns is None:
-            return F.pad(features, (0, N_RETURN_FEATURES))
-        known = th.ones_like(returns)
-        return th.cat([features, self.return_normalization(returns), known], dim=1)
-
-    def q_values(
-        self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor, returns: th.Tensor | None = None
-    ) -> tuple[th.Tensor, th.Tensor]:
+    def q_values(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         :param features: (B, features_dim) from :meth:`features`
         :param latents: (B, latent_dim)
         :param parameters: (B, n_parameters) scaled parameters
-        :param returns: (B, 1) what episodes have returned before the action; None: not known
         :return: Q1 and Q2, each (B, 1), in the units of :class:`ValueScale`
         """
-        inputs = self.with_returns(features, returns)
-        q1, q2 = (q_net(inputs, latents, parameters) for q_net in self.q_networks)
+        q1, q2 = (q_net(features, latents, parameters) for q_net in self.q_networks)
         return q1, q2
 
     def scores(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> tuple[th.Tensor, ...]:
@@ -188,8 +196,7 @@ class HybridCritic(BaseModel):
 
     def score1(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
         """:return: (B, 1) the first of :meth:`scores` alone"""
-        q1 = self.q_networks[0](self.with_returns(features, None), latents, parameters)
-        return self.weigh((q1,), features, latents, parameters)[0]
+        return self.weigh((self.q_networks[0](features, latents, parameters),), features, latents, parameters)[0]
 
     def weigh(
         self, q_values: tuple[th.Tensor, ...], features: th.Tensor, latents: th.Tensor, parameters: th.Tensor
@@ -205,6 +212,8 @@ class HybridCritic(BaseModel):
         for network, summand in zip([*self.q_networks, self.reward_network], summands[[0, 0, 1]], strict=True):
             assert isinstance(network, QNetwork)
             network.rescale(factor, summand)
+        if self.return_network is not None:
+            self.return_network.network.rescale(factor, summands.new_zeros(()))
 
     def get_extra_state(self) -> th.Tensor:
         return th.tensor(self.foresight, dtype=th.float64)

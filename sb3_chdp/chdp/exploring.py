@@ -34,7 +34,7 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
     """
 
     policy: CHDPPolicy
-    # Whether rows hold what episodes have returned, which critics are then told in targets
+    # Whether rows hold what episodes have returned, on which the values of next states then depend
     knows_returns: ClassVar[bool] = True
 
     def __init__(self, *args: Any, **kwargs: Any):

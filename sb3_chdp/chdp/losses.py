@@ -20,13 +20,16 @@ def next_values(
     :param policy: the networks
     :param observations: (B, ...) next observations
     :param masks: (B, K) False for discrete actions that may not be taken, None if all may
-    :param returns: (B, 1) what episodes have returned, which the policies are not told; None: nor are the critics
+    :param returns: (B, 1) what episodes have returned, which the policies do not know; None: not known at all
     :return: (B, 1) values in the units of the rewards, with all that follows
     """
     features = policy.critic_target.features(observations)
     latents, _, parameters = policy.select_target(policy.actor_target, policy.choosing_critic, features, masks=masks)
-    q1, q2 = policy.critic_target.q_values(features, latents, parameters, returns)
-    return policy.value_scale.values(th.min(q1, q2))
+    critic = policy.critic_target
+    values = th.min(*critic.q_values(features, latents, parameters))
+    if returns is not None and critic.return_network is not None:
+        values = values + critic.return_network(features, latents, parameters, returns)
+    return policy.value_scale.values(values)
 
 
 @th.no_grad()
@@ -48,8 +51,7 @@ def critic_loss(
     policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, targets: th.Tensor
 ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
     """
-    Eq. 10, (Q_j(s, e, a) - y)^2, weighted if the replay is prioritised; half of it for critics that are told what the
-    episode has returned, if rows hold it, half for critics that are not.
+    Eq. 10, (Q_j(s, e, a) - y)^2, weighted if the replay is prioritised.
 
     It has a gradient for the codebook, which may be used.
 
@@ -57,20 +59,16 @@ def critic_loss(
     :param replay_data: a batch
     :param features: (B, features_dim) features of the observations
     :param targets: (B, 1) targets y in the units of the critics
-    :return: sum over both critics, and without knowledge of returns the detached (B, 1) values of the first and the larger
-        (B,) absolute error of both
+    :return: sum over both critics, the detached (B, 1) values of the first, and the larger (B,) absolute error of both
     """
     # The gradient with respect to a latent is also that of the codeword
     codewords = policy.actor.codebook(replay_data.discrete_actions)
     latents = replay_data.latents + (codewords - codewords.detach())
 
-    inputs = features, latents, replay_data.parameters
-    q_values = [th.cat(policy.critic.q_values(*inputs), dim=1)]
-    if replay_data.returns is not None:
-        q_values.append(th.cat(policy.critic.q_values(*inputs, replay_data.returns), dim=1))
-    errors = th.stack(q_values) - targets
-    loss = (replay_data.weights * errors.square()).sum(dim=2).mean()
-    return loss, q_values[0][:, :1].detach(), errors[0].detach().abs().amax(dim=1)
+    q_values = th.cat(policy.critic.q_values(features, latents, replay_data.parameters), dim=1)
+    errors = q_values - targets
+    loss = (replay_data.weights * errors.square()).sum(dim=1).mean()
+    return loss, q_values[:, :1].detach(), errors.detach().abs().amax(dim=1)
 
 
 def reward_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, targets: th.Tensor) -> th.Tensor:
@@ -85,6 +83,21 @@ def reward_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, features: 
     assert policy.critic.reward_network is not None, "PaperCHDP has none"
     rewards = policy.critic.reward_network(features, replay_data.latents, replay_data.parameters)
     return (replay_data.weights * (rewards - targets).square()).mean()
+
+
+def return_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, errors: th.Tensor) -> th.Tensor:
+    """
+    Squared error of what returns add to the values, weighted if the replay is prioritised.
+
+    :param policy: the networks
+    :param replay_data: a batch with returns
+    :param features: (B, features_dim) features of the observations, without gradient
+    :param errors: (B, 1) by how much the targets of the critics exceed their values
+    """
+    network, returns = policy.critic.return_network, replay_data.returns
+    assert network is not None and returns is not None, "rows hold no returns"
+    summands = network(features, replay_data.latents, replay_data.parameters, returns)
+    return (replay_data.weights * (summands - errors).square()).mean()
 
 
 def discrete_policy_loss(

@@ -13,13 +13,13 @@ from torch import nn
 from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.candidates import FixedDraws, Selection
 from sb3_chdp.chdp.codebook import Codebook
-from sb3_chdp.chdp.critic import N_RETURN_FEATURES, AttentionReads, HybridCritic, QNetwork
+from sb3_chdp.chdp.critic import AttentionReads, HybridCritic, QNetwork, ReturnNetwork
 from sb3_chdp.chdp.diffusion import DiffusionModel
 from sb3_chdp.chdp.product_codebook import ProductCodebook
 from sb3_chdp.chdp.repeatable_noise import repeatable_noise
 from sb3_chdp.chdp.value_scale import ValueScale
 from sb3_chdp.common.hybrid_box import HybridBox
-from sb3_chdp.common.normalization import NormalizedCombinedExtractor, NormalizedExtractor, RunningNormalization
+from sb3_chdp.common.normalization import NormalizedCombinedExtractor, NormalizedExtractor
 from sb3_chdp.common.policies import CnnFeatures, HybridPolicy
 from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.common.utils import default_optimizer_kwargs
@@ -117,8 +117,8 @@ class CHDPPolicy(HybridPolicy):
         self.continuous_optimizer = self._make_optimizer(continuous, lr_schedule)
         value_networks = nn.ModuleList([self.critic.features_extractor, self.critic.q_networks])
         self.critic.optimizer = self._make_optimizer(value_networks, lr_schedule)
-        rewards = self.critic.reward_network
-        self.reward_optimizer = None if rewards is None else self._make_optimizer(rewards, lr_schedule)
+        beside = [net for net in (self.critic.reward_network, self.critic.return_network) if net is not None]
+        self.reward_optimizer = self._make_optimizer(nn.ModuleList(beside), lr_schedule) if beside else None
         self.codebook_optimizer = self._make_optimizer(actor.codebook, lr_schedule)
 
         # Random actions of deterministic predictions, the same for every model
@@ -128,21 +128,17 @@ class CHDPPolicy(HybridPolicy):
         self.register_buffer("fixed_parameters", parameters, persistent=False)
 
     def _make_critic(self, extractor: BaseFeaturesExtractor, latent_dim: int) -> HybridCritic:
-        n_parameters, n_features = self.action_space.spec.max_parameters, extractor.features_dim
+        n_parameters = self.action_space.spec.max_parameters
         critic_arch = get_actor_critic_arch(self.net_arch)[1]
-        knows_returns = "returns" in self.action_space.columns
-        n_inputs = n_features + (N_RETURN_FEATURES if knows_returns else 0)
-        q1, q2, rewards = (
-            QNetwork(n, latent_dim, n_parameters, critic_arch, self.activation_fn, self.n_reads)
-            for n in (n_inputs, n_inputs, n_features)
-        )
+        sizes = extractor.features_dim, latent_dim, n_parameters, critic_arch, self.activation_fn, self.n_reads
+        q1, q2, rewards = (QNetwork(*sizes) for _ in range(3))
         return HybridCritic(
             self.observation_space,
             self.action_space,
             extractor,
             [q1, q2],
-            RunningNormalization(1) if knows_returns else None,
             rewards,
+            ReturnNetwork(*sizes) if "returns" in self.action_space.columns else None,
             self.normalize_images,
         )
 
