@@ -64,7 +64,6 @@ def critic_loss(
     # The gradient with respect to a latent is also that of the codeword
     codewords = policy.actor.codebook(replay_data.discrete_actions)
     latents = replay_data.latents + (codewords - codewords.detach())
-
     q_values = th.cat(policy.critic.q_values(features, latents, replay_data.parameters), dim=1)
     errors = q_values - targets
     loss = (replay_data.weights * errors.square()).sum(dim=1).mean()
