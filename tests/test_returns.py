@@ -66,7 +66,7 @@ class Unaware(CHDP):
 
 
 def test_a_bonus_that_is_paid_once_does_not_look_as_if_it_came_again():
-    """Two steps later the prize is worth 0.95^2 of it. Critics that do not know returns say 4 times as much."""
+    """Two steps later the prize is worth 0.95^2 of it. Critics that do not know returns say far more."""
     assert advantage_of_going_back(CHDP, seed=1) < 5 < 15 < advantage_of_going_back(Unaware, seed=1)
 
 

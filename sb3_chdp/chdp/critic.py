@@ -13,7 +13,7 @@ from sb3_chdp.common.normalization import RunningNormalization
 
 # Factor of the logits, which start small
 SHARPNESS = 3.0
-# Over fewer entries side by side, softmax on a processor takes several times as long as over entries further apart
+# On a processor, softmax over fewer entries is faster where they do not lie side by side
 SLOW_SOFTMAX = 16
 
 

@@ -117,6 +117,7 @@ class CHDPPolicy(HybridPolicy):
         self.continuous_optimizer = self._make_optimizer(continuous, lr_schedule)
         value_networks = nn.ModuleList([self.critic.features_extractor, self.critic.q_networks])
         self.critic.optimizer = self._make_optimizer(value_networks, lr_schedule)
+        # One for both networks beside the critics
         beside = [net for net in (self.critic.reward_network, self.critic.return_network) if net is not None]
         self.reward_optimizer = self._make_optimizer(nn.ModuleList(beside), lr_schedule) if beside else None
         self.codebook_optimizer = self._make_optimizer(actor.codebook, lr_schedule)
