@@ -1,7 +1,7 @@
 """
 What the documents show of the published results: protocol, tables and figures from the files in ``results``.
 
-    python benchmarks/publish.py             protocol.yml, the tables in the two README files, figures
+    python benchmarks/publish.py             protocol.yml, figures, the tables in the two README files and in tuning.md
     python benchmarks/publish.py --print     tables, printed only
 
 A run that is to be published comes into results/<table>/<algorithm or variant>/<environment>, CSV and JSON.
@@ -23,7 +23,10 @@ from sb3_chdp.registry import ALGORITHMS
 ROOT = Path(__file__).parent
 RESULTS = ROOT / "results"
 README = ROOT / "README.md"
+TUNING = ROOT / "tuning.md"
 FIGURES = ROOT / "figures"
+# Runs of CHDP with its one setting for all environments
+ONE_SETTING = "one_setting"
 # Of the ablations: tables, their rows, and the paper's success rates in percent in the order of the rows
 TABLES = {"ablation": "Ablation with the paper's settings", "ablation_tuned": "Ablation with our settings"}
 VARIANTS = ("full", "without_diffusion", "without_codebook", "without_sequential_update", "without_both")
@@ -60,11 +63,25 @@ def overview(scores: pd.DataFrame, rows: list[str], envs: list[str]) -> str:
     return tables.markdown(["environment", display_name(first), "best baseline", f"{display_name(first)} in the paper"], lines)
 
 
+def one_setting(cells: list[paper.Cell], scores: pd.DataFrame) -> str:
+    """:return: a line per environment: score, seed and commit of every run"""
+    scores_of_runs = scores.set_index(["env", "seed"])["score"]
+    lines = []
+    for cell in cells:
+        env, seeds = cell["environment"], cell["seeds"]
+        values = tables.numbers(scores_of_runs[env, seed] for seed in seeds)
+        lines.append([env, f"{cell['steps']:,}", *(", ".join(map(str, column)) for column in (values, seeds, seeds.values()))])
+    return tables.markdown(["environment", "environment steps", "success, %", "seeds", "commits"], lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--print", action="store_true", dest="only_print")
     args = parser.parse_args()
     protocol = {table: paper.describe_cells(RESULTS, table) for table in (MAIN, *TABLES)}
+    today = one_setting(
+        yaml_order(paper.describe_cells(RESULTS, ONE_SETTING)), scores_of(read_results(RESULTS / ONE_SETTING))
+    )
     results = read_results(RESULTS / MAIN)
     scores = scores_of(results)
     envs = tables.order(scores["env"], [cell["environment"] for cell in yaml_order(protocol[MAIN])])
@@ -77,11 +94,12 @@ def main() -> None:
         columns = {"paper": paper_column, "settings": paper.deviation_column(protocol[table])}
         parts += [f"### {title}", tables.score_table(ablation, variants, tables.order(ablation["env"], []), columns)]
     text = "\n\n".join(parts)
-    print(text)
+    print(text, today, sep="\n\n")
     if args.only_print:
         return
     paper.PROTOCOL.write_text(PROTOCOL_HEADER + yaml.safe_dump(protocol, sort_keys=False, width=127))
     replace_section(README, "tables", text)
+    replace_section(TUNING, "one setting", today)
     replace_section(ROOT.parent / "README.md", "tables", overview(scores, rows, envs))
     for x, name in (("timesteps", "curves.png"), ("minutes", "curves_minutes.png")):
         figures.plot_curves(results, scores, rows, envs, x, FIGURES / name)
