@@ -13,11 +13,11 @@ from torch.distributions import Categorical, Normal
 from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3, PDQNTD3, FlattenHybridAction, HyARTD3, HybridActionSpec, check_hybrid_env
 from sb3_chdp.chdp import PaperCHDP
 from sb3_chdp.common import off_policy_algorithm
-from sb3_chdp.common.distributions import HybridDistribution
 from sb3_chdp.common.evaluation import evaluate_policy
 from sb3_chdp.common.hybrid_box import ConcatenatedBox
 from sb3_chdp.common.masks import read_masks
 from sb3_chdp.envs.hard_move import motion_table, unit_motions
+from sb3_chdp.hppo.distributions import HybridDistribution
 from sb3_chdp.hyar_td3.representation import ActionBatch, FactoredActionRepresentation
 from tests.algorithms import has_learnt, make_model, snapshot
 from tests.hybrid_envs import LayoutEnv, box, gym_make

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import CheckpointCallback
+from stable_baselines3.common.callbacks import CheckpointCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chdp import CHDP
@@ -151,9 +151,18 @@ def test_ends_of_episodes(monkeypatch):
     claims = Claims(np.empty((3, 0)), np.arange(3), np.zeros(3), np.array([1.0, 10.0, 100.0]), np.array([0.5, 0.5, 0.5]))
     infos = [{}, {}, {"TimeLimit.truncated": True}]
     rewards = np.array([3.0, 4.0, 5.0], dtype=np.float32)
-    model._check_claims(claims, model._last_obs, rewards, np.array([False, True, True]), infos)
+    model._check_claims(claims, claims.rows, model._last_obs, rewards, np.array([False, True, True]), infos)
     goes_on, ends = (3 + 7 * model.gamma - 2) / 2 - 0.5, (4 - 2) / 2 - 0.5
     assert model.foresight_sums.fy == pytest.approx(goes_on + 10 * ends, rel=0.01)
+
+
+def test_claims_of_a_step_that_was_never_stored_are_forgotten():
+    model = fast_model(learning_starts=10, learning_rate=0.0)
+    model._exploration_rate = lambda: 1.0
+    model.learn(40, StopTrainingOnMaxEpisodes(20))
+    assert model._claims is not None
+    model._setup_learn(10, reset_num_timesteps=False)
+    assert model._claims is None
 
 
 def test_masks_and_several_environments():

@@ -13,8 +13,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from torch.distributions import Categorical, Normal
 
 from sb3_chdp import HPPO
-from sb3_chdp.common.distributions import HybridDistribution
 from sb3_chdp.common.hybrid_box import ConcatenatedBox
+from sb3_chdp.hppo.distributions import HybridDistribution
 from tests.algorithms import LAYOUTS, make_model
 from tests.hybrid_envs import LayoutEnv, MaskedEnv, layouts, make_layout_env
 

@@ -6,9 +6,9 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_chdp import HybridActionSpec
-from sb3_chdp.common.distributions import HybridDistribution
 from sb3_chdp.common.hybrid_box import ConcatenatedBox, ScoreBox
 from sb3_chdp.common.masks import read_masks
+from sb3_chdp.hppo.distributions import HybridDistribution
 from tests.hybrid_envs import box
 
 RADICES = (3, 2, 2, 2, 4)

@@ -42,6 +42,35 @@ def test_no_algorithm_takes_a_forbidden_action(algorithm, layout):
 
 
 @pytest.mark.parametrize("algorithm", CLASSES)
+def test_as_many_joint_actions_as_values_of_parts(algorithm):
+    """Of 2 x 2: which of the forms a mask of four has cannot be told from its length."""
+
+    class SwitchesEnv(LayoutEnv):
+        def action_masks(self):
+            return self.masks
+
+        def _draw(self):
+            # What one of the switches is to be
+            self.masks = np.ones(4, dtype=bool)
+            self.masks[self.np_random.integers(4)] = False
+
+        def reset(self, **kwargs):
+            outcome = super().reset(**kwargs)
+            self._draw()
+            return outcome
+
+        def step(self, action):
+            assert self.masks[[action[0][0], 2 + action[0][1]]].all(), f"{action} is masked"
+            outcome = super().step(action)
+            self._draw()
+            return outcome
+
+    env = make_vec_env(lambda: SwitchesEnv(spaces.Tuple((spaces.MultiDiscrete([2, 2]), box(-1, 1, 1)))), 2)
+    model = make_model(algorithm, env).learn(80)
+    evaluate_masked_policy(model, env, 4, deterministic=False)
+
+
+@pytest.mark.parametrize("algorithm", CLASSES)
 def test_predictions(algorithm, tmp_path):
     env = make_vec_env(MaskedEnv, 2)
     model = make_model(algorithm, env)

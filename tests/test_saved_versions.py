@@ -11,6 +11,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 import sb3_chdp
 from sb3_chdp import CHDP, HHQNTD3, PATD3
+from sb3_chdp.chdp import PaperCHDP
 from tests.algorithms import make_model
 from tests.hybrid_envs import make_layout_env
 from tests.saved_files import entry, rewrite, same_predictions, saved_model, torch_file
@@ -32,6 +33,12 @@ def test_subclasses(tmp_path):
     same_predictions(model, mine)
     mine.save(tmp_path / "mine")
     same_predictions(model, CHDP.load(tmp_path / "mine"))
+
+
+def test_the_papers_algorithm_is_another_one(tmp_path):
+    saved_model(PaperCHDP, tmp_path)
+    with pytest.raises(ValueError, match=r"model is not a CHDP: it holds a sb3_chdp\.chdp\.paper\.PaperCHDP"):
+        CHDP.load(tmp_path / "model")
 
 
 def test_version_that_is_too_old(tmp_path):

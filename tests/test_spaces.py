@@ -292,10 +292,12 @@ def test_rows_are_packed_by_name(tensor):
 
 
 def test_hybrid_box_pickles_and_compares():
-    first = HybridBox(layouts()["nested"], latent_dim=4)
+    first = HybridBox(layouts()["nested"], stored_latent_dim=4)
     assert first.shape == (7,)
     assert pickle.loads(pickle.dumps(first)) == first
-    assert first != HybridBox(layouts()["nested"], latent_dim=5) and first != HybridBox(layouts()["flat"], latent_dim=4)
+    assert first != HybridBox(layouts()["nested"], stored_latent_dim=5) and first != HybridBox(
+        layouts()["flat"], stored_latent_dim=4
+    )
     assert first != spaces.Box(first.low, first.high)
 
 

@@ -7,8 +7,10 @@ import pytest
 import torch as th
 from stable_baselines3 import TD3
 
-from sb3_chdp import HHQNTD3, PATD3, FlattenHybridAction
+from sb3_chdp import HHQNTD3, PATD3, PDQNTD3, FlattenHybridAction
+from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.td3 import InvertingGradients
+from tests.algorithms import make_model
 from tests.hybrid_envs import make_layout_env
 
 SMALL: dict[str, Any] = dict(
@@ -87,3 +89,9 @@ def test_exploration_noise_reaches_scores_and_parameters():
     obs = model.replay_buffer.observations[:200, 0]
     difference = rows - model.policy.predict_rows(obs)
     assert np.all(np.abs(difference.std(axis=0) - 0.3) < 0.06) and np.abs(rows).max() <= 1
+
+
+@pytest.mark.parametrize("algorithm", [PATD3, PDQNTD3])
+def test_priorities_that_nobody_would_set_are_refused(algorithm):
+    with pytest.raises(ValueError, match=f"replay_buffer_class must not be PrioritizedReplayBuffer for {algorithm.__name__}"):
+        make_model(algorithm, make_layout_env(), replay_buffer_class=PrioritizedReplayBuffer)

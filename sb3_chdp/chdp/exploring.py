@@ -55,6 +55,7 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
+        self._claims = None
         if reset_num_timesteps or self._last_obs is None:
             # The environment is reset: no return is that of half an episode and of another one
             self.returns_so_far = []
@@ -87,7 +88,7 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         self._add_rewards(rows, rewards)
         super()._store_transition(replay_buffer, *args)
         if self._claims is not None and self._n_updates >= MIN_UPDATES:
-            self._check_claims(self._claims, new_obs, rewards, dones, infos)
+            self._check_claims(self._claims, rows, new_obs, rewards, dones, infos)
         self._claims = None
         self._count_returns(dones)
 
@@ -109,11 +110,17 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         self.n_informative_steps += informative_steps(self.n_envs, returns)
 
     def _check_claims(
-        self, claims: Claims, new_obs: Any, rewards: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
+        self,
+        claims: Claims,
+        rows: np.ndarray,
+        new_obs: Any,
+        rewards: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
     ) -> None:
         """Compare what was claimed to come of exploratory actions with the rewards and the values of what followed."""
-        masks = self._action_masks()
-        next_masks = None if masks is None else th.as_tensor(masks, device=self.device)
+        columns = self.hybrid_space.columns
+        next_masks = self.policy.mask_tensor(columns.masks(rows, "next_masks") if self.use_masking else None)
         returns = th.tensor(self.returns_so_far, dtype=th.float32, device=self.device)[:, None]
         values = next_values(self.policy, self.policy.obs_to_tensor(new_obs)[0], next_masks, returns)
         came = th.as_tensor(rewards + self.gamma * (1 - dones) * values.flatten().cpu().numpy(), device=self.device)

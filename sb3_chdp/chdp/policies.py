@@ -212,7 +212,7 @@ class CHDPPolicy(HybridPolicy):
         else:
             select, actor, fixed = self.select, self.acting_actor, None
         latents, k, parameters = select(actor, self.critic_target, features, fixed, action_masks)
-        stored_latents = latents[:, : self.action_space.latent_dim]
+        stored_latents = latents[:, : self.action_space.stored_latent_dim]
         return self.action_space.columns.pack(discrete_actions=k.float(), parameters=parameters, latents=stored_latents)
 
     def _fixed_draws(self, observation: PyTorchObs) -> FixedDraws:

@@ -188,10 +188,10 @@ class HybridAlgorithm(BaseAlgorithm):
             raise NonFiniteLossError(
                 error.name,
                 error.loss,
-                f" at step {self.num_timesteps}, after {self._n_updates} updates. The model is as it was before, {where}. "
+                f" at step {self.num_timesteps}, after {self._n_updates} updates. It moved no parameter, {where}. "
                 "What helps: a smaller learning_rate, smaller rewards or observations",
             ) from error
-        except Exception:
+        except BaseException:  # KeyboardInterrupt is no Exception
             self._last_obs = None  # the environment may have gone on, or begun anew: learning begins with a reset again
             raise
 

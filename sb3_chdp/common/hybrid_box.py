@@ -21,16 +21,16 @@ class HybridBox(spaces.Box):
 
     :param native: the user's action space
     :param layout: see :class:`HybridActionSpec`
-    :param latent_dim: width of what an algorithm stores behind the parameters
+    :param stored_latent_dim: width of what an algorithm stores behind the parameters
     :param state_parts: what else the rows hold, of ``MASK_PARTS`` and ``RETURN_PARTS``
     """
 
     def __init__(
-        self, native: spaces.Space[Any], layout: str = "auto", latent_dim: int = 0, state_parts: tuple[str, ...] = ()
+        self, native: spaces.Space[Any], layout: str = "auto", stored_latent_dim: int = 0, state_parts: tuple[str, ...] = ()
     ):
         self.native = native
         self.spec = HybridActionSpec(native, layout)
-        self.latent_dim = latent_dim
+        self.stored_latent_dim = stored_latent_dim
         self.state_parts = tuple(state_parts)
         radices = self.spec.radices
         mask_width = -(-sum(radices) // BITS)
@@ -48,7 +48,9 @@ class HybridBox(spaces.Box):
 
     def _widths(self) -> dict[str, int]:
         """:return: columns of an action by name"""
-        return dict(discrete_actions=len(self.spec.radices), parameters=self.spec.max_parameters, latents=self.latent_dim)
+        return dict(
+            discrete_actions=len(self.spec.radices), parameters=self.spec.max_parameters, latents=self.stored_latent_dim
+        )
 
     def to_native(self, rows: np.ndarray) -> list[Any]:
         """:return: n native actions of (n, columns) rows"""
@@ -97,7 +99,7 @@ class HybridBox(spaces.Box):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The tables of the spec follow from the native space
-        arguments = (self.native, self.spec.layout, self.latent_dim, self.state_parts)
+        arguments = (self.native, self.spec.layout, self.stored_latent_dim, self.state_parts)
         return type(self), arguments, {"_np_random": self._np_random}
 
 

@@ -1,9 +1,12 @@
-"""n-step returns with what is known of the states that they end in."""
+"""Replay of more than one step of an episode: where it ends, and n-step returns with what is known of the last state."""
+
+import warnings
 
 import numpy as np
-from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.her import HerReplayBuffer
 
 from sb3_chdp.common.hybrid_box import HybridBox
 
@@ -36,3 +39,22 @@ class HybridNStepReplayBuffer(NStepReplayBuffer):
             if name.startswith("next_"):
                 columns.view(samples.actions, name)[:] = columns.view(last_rows, name)
         return samples
+
+
+def end_trajectories(buffer: ReplayBuffer) -> None:
+    """
+    Let unfinished episodes end with the newest transitions, as at a time limit: what is added next comes of a reset.
+
+    :param buffer: the replay buffer, which may be empty
+    """
+    if buffer.size() == 0:
+        return
+    newest = (buffer.pos - 1) % buffer.buffer_size
+    if isinstance(buffer, HerReplayBuffer):
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="The last trajectory in the replay buffer")
+            buffer.truncate_last_trajectory()
+    elif buffer.optimize_memory_usage:
+        buffer.dones[newest] = 1  # the next observation, which it takes from what is added next, counts for nothing
+    else:
+        buffer.timeouts[newest] = np.maximum(buffer.timeouts[newest], 1 - buffer.dones[newest])

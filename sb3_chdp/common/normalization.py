@@ -78,7 +78,7 @@ class RunningNormalization(nn.Module):
         z = self._standardize(x - self.running_mean)
         self.running_correlation.lerp_(z.T @ z / len(z), weight)
         if n_updates < UPDATES_PER_WHITENING or n_updates % UPDATES_PER_WHITENING == 0:
-            # In double precision, which some accelerators lack
+            # In double precision, on the processor
             eigenvalues, eigenvectors = th.linalg.eigh(self.running_correlation.cpu().double())
             scales = (eigenvalues.clamp(min=0) + SHRINKAGE).rsqrt()
             self.running_transform.copy_(eigenvectors * scales @ eigenvectors.T)

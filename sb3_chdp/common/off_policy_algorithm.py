@@ -9,6 +9,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
@@ -20,7 +21,7 @@ from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.buffer_file import check_buffer, load_buffer, save_buffer
 from sb3_chdp.common.checks import check_numbers
 from sb3_chdp.common.masks import INFO_KEY, read_masks
-from sb3_chdp.common.n_step_buffer import HybridNStepReplayBuffer
+from sb3_chdp.common.n_step_buffer import HybridNStepReplayBuffer, end_trajectories
 from sb3_chdp.common.policies import HybridPolicy
 from sb3_chdp.common.rows import MASK_PARTS, pack_bits
 from sb3_chdp.common.safe_zip import refuse
@@ -212,9 +213,20 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         """SB3's ``collect_rollouts``, in which actions are rows."""
         rollout = super().collect_rollouts(self.native_env(env), *args, **kwargs)
         if not rollout.continue_training:
-            # The last step was not stored: what follows would not be what came of the action before
-            self._last_obs = None
+            self._last_obs = None  # the last step was not stored: learning begins with a reset again
         return rollout
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if self.replay_buffer is not None and (reset_num_timesteps or self._last_obs is None):
+            end_trajectories(self.replay_buffer)  # the environment is reset
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _sample_action(
         self,

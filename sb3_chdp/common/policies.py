@@ -8,6 +8,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
+from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_chdp.common.arguments import check_device
 from sb3_chdp.common.checks import LARGEST, check_numbers
@@ -23,8 +24,8 @@ class HybridPolicy(BasePolicy):
     Base class of policies for hybrid action spaces.
 
     Networks work on rows ``[k | scaled parameters | latent]`` (:class:`HybridBox`); ``predict`` returns native actions.
-    Subclasses implement ``_predict(observation, deterministic, action_masks)``, which returns rows. Masks are (n, K) boolean
-    tensors; without any the argument is not given.
+    Subclasses implement ``_predict(observation, deterministic, action_masks)``, which returns rows. ``predict`` takes masks as
+    environments give them; all other methods take what :func:`read_masks` makes of them, (n, K) booleans, or None.
     """
 
     action_space: HybridBox
@@ -49,8 +50,11 @@ class HybridPolicy(BasePolicy):
         :raises ValueError: if the observation has another shape, or holds NaN, infinity or numbers beyond 1e15; for masks that
             do not fit or allow nothing
         """
-        rows, vectorized_env = self._predict_rows(observation, deterministic, action_masks)
-        actions = self.action_space.to_native(rows)
+        obs_tensor, vectorized_env = self._checked_observation(observation)
+        if action_masks is not None:
+            n = len(obs_tensor) if isinstance(obs_tensor, th.Tensor) else len(next(iter(obs_tensor.values())))
+            action_masks = read_masks(self.action_space.spec, action_masks, n)
+        actions = self.action_space.to_native(self._rows(obs_tensor, deterministic, action_masks))
         return (actions if vectorized_env else actions[0]), state
 
     def predict_rows(
@@ -62,26 +66,26 @@ class HybridPolicy(BasePolicy):
         """
         Like :meth:`predict`, for code that needs arrays.
 
+        :param observation: the input observation
+        :param deterministic: whether to return the same action for the same observation every time
+        :param action_masks: (n, K) False for discrete actions that may not be taken
         :return: rows ``[k | scaled parameters | latent]``, (n, columns) for n observations, (columns,) for one
         """
-        rows, vectorized_env = self._predict_rows(observation, deterministic, action_masks)
+        obs_tensor, vectorized_env = self._checked_observation(observation)
+        rows = self._rows(obs_tensor, deterministic, action_masks)
         return rows if vectorized_env else rows[0]
 
-    def mask_arguments(self, action_masks: np.ndarray | None, n: int) -> dict[str, th.Tensor]:
-        """
-        :param action_masks: masks of n observations in the form of :func:`read_masks`
-        :param n: number of observations
-        :return: the argument ``action_masks`` of networks, (n, K); nothing if there are no masks, of which not every policy
-            needs to know
-        """
-        if action_masks is None:
-            return {}
-        return {"action_masks": th.as_tensor(read_masks(self.action_space.spec, action_masks, n), device=self.device)}
+    def mask_tensor(self, action_masks: np.ndarray | None) -> th.Tensor | None:
+        """:return: masks on the policy's device"""
+        return None if action_masks is None else th.as_tensor(action_masks, device=self.device)
 
-    def _predict_rows(
-        self, observation: np.ndarray | dict[str, np.ndarray], deterministic: bool, action_masks: np.ndarray | None
-    ) -> tuple[np.ndarray, bool]:
+    def _rows(self, obs: PyTorchObs, deterministic: bool, action_masks: np.ndarray | None) -> np.ndarray:
         self.set_training_mode(False)
+        with th.no_grad():
+            return self._predict(obs, deterministic, self.mask_tensor(action_masks)).cpu().numpy()  # type: ignore[call-arg]
+
+    def _checked_observation(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+        """:return: the observation as a tensor or a dict of them, and whether it is one of several environments"""
         # Common mistake, see https://github.com/DLR-RM/stable-baselines3/issues/1694
         if isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict):
             raise ValueError(
@@ -95,10 +99,7 @@ class HybridPolicy(BasePolicy):
             for key, part in parts.items():
                 name = f"observation[{key!r}]" if key else "observation"
                 check_numbers(name, np.asarray(part) if vectorized_env else np.asarray(part)[None])
-        masks = self.mask_arguments(action_masks, len(next(iter(tensors.values()))))
-        with th.no_grad():
-            rows = self._predict(obs_tensor, deterministic=deterministic, **masks)
-        return rows.cpu().numpy(), vectorized_env
+        return obs_tensor, vectorized_env
 
     def save(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """

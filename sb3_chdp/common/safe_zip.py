@@ -164,6 +164,9 @@ def read_model(
         data = json.loads(archive.read("data"))
     if header is None:
         _check_policy_module(cls, data, name)
+    elif header.classes[0].startswith("sb3_chdp.") and header.classes[0] not in map(qualified_name, cls.__mro__):
+        # PaperCHDP is a CHDP, but its rows and networks are others; what users derive from an algorithm it loads
+        raise ValueError(f"{name} is not a {cls.__name__}: it holds a {header.classes[0]}")
     # An environment by name could be one whose module Gymnasium imports
     needs_trust = [*_pickled(data), *(["env"] if isinstance(data.get("env"), str) else [])]
     pickled = [key for key in needs_trust if key not in custom_objects]

@@ -15,6 +15,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from sb3_chdp.common.arguments import FRACTION, SWITCH, Accepted, number, of_networks, optional
+from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.hybrid_box import HybridBox, ScoreBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.policies import HybridPolicy
@@ -89,8 +90,7 @@ class HybridTD3Policy(HybridPolicy, TD3Policy):
         with th.no_grad():
             # One environment: the noise has no batch dimension
             noise_tensor = th.as_tensor(noise, dtype=th.float32, device=self.device).view(-1, self.noise_dim)
-            masks = self.mask_arguments(action_masks, len(noise_tensor))
-            return self._noisy_rows(obs_tensor, noise_tensor, **masks).cpu().numpy()
+            return self._noisy_rows(obs_tensor, noise_tensor, self.mask_tensor(action_masks)).cpu().numpy()
 
     def _predict(
         self, observation: PyTorchObs, deterministic: bool = False, action_masks: th.Tensor | None = None
@@ -98,7 +98,7 @@ class HybridTD3Policy(HybridPolicy, TD3Policy):
         """:return: (n, columns) rows"""
         return self._complete(self.actor_outputs(self.actor, observation, action_masks))
 
-    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor, action_masks: th.Tensor | None = None) -> th.Tensor:
+    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor, action_masks: th.Tensor | None) -> th.Tensor:
         """:return: (n, columns) rows for (n, noise_dim) noise on the actor's output"""
         return self._complete(self.mask_outputs((self.actor(obs) + noise).clamp(-1, 1), action_masks))
 
@@ -251,6 +251,11 @@ class HybridTD3(HybridOffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         super()._setup_model()
+        if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
+            raise ValueError(
+                f"replay_buffer_class must not be {type(self.replay_buffer).__name__} for {type(self).__name__}, which would "
+                "never set a priority: CHDP does"
+            )
         initial_noise = self.exploration_noise if self.exploration_initial_noise is None else self.exploration_initial_noise
         fraction = max(self.exploration_fraction, 1e-9)  # a schedule divides by it
         self.exploration_schedule = LinearSchedule(self.exploration_initial_eps, self.exploration_final_eps, fraction)

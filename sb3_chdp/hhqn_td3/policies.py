@@ -69,7 +69,7 @@ class HHQNTD3Policy(HybridTD3Policy):
     def actor_outputs(self, actor: Actor, obs: PyTorchObs, action_masks: th.Tensor | None) -> th.Tensor:
         return actor(obs, action_masks=action_masks)
 
-    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor, action_masks: th.Tensor | None = None) -> th.Tensor:
+    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor, action_masks: th.Tensor | None) -> th.Tensor:
         return self._complete(self.actor(obs, noise, action_masks))
 
 

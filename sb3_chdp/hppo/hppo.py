@@ -29,9 +29,9 @@ from sb3_chdp.common.arguments import (
 )
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox
-from sb3_chdp.common.rollout_buffers import HybridDictRolloutBuffer, HybridRolloutBuffer
 from sb3_chdp.common.utils import NonFiniteLossError, gradient_step
 from sb3_chdp.hppo.policies import CnnPolicy, HPPOPolicy, MlpPolicy, MultiInputPolicy
+from sb3_chdp.hppo.rollout_buffers import HybridDictRolloutBuffer, HybridRolloutBuffer
 
 SelfHPPO = TypeVar("SelfHPPO", bound="HPPO")
 
@@ -216,6 +216,7 @@ class HPPO(HybridAlgorithm, PPO):
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
             if not callback.on_step():
+                self._last_obs = None  # the step is not stored: learning begins with a reset again
                 return False
 
             self._update_info_buffer(infos, dones)

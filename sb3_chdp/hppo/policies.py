@@ -7,9 +7,9 @@ from sb3_contrib.common.maskable.distributions import MaybeMasks
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
-from sb3_chdp.common.distributions import HybridDistribution
 from sb3_chdp.common.hybrid_box import ConcatenatedBox
 from sb3_chdp.common.policies import CnnFeatures, CombinedFeatures, HybridPolicy
+from sb3_chdp.hppo.distributions import HybridDistribution
 
 
 class HPPOPolicy(HybridPolicy, ActorCriticPolicy):

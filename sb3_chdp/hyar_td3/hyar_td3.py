@@ -41,7 +41,7 @@ class HyARTD3(HybridTD3):
         4. relabelled z are the encoder's means (there samples); log standard deviations in [-4, 4] (there up to 15);
         5. parameters that an action does not have are no targets of the reconstruction;
         6. latent bounds have a least width;
-        7. ``representation_steps`` batches every ``representation_freq`` gradient steps (there one batch per ten episodes);
+        7. ``representation_steps`` batches after ``representation_freq`` gradient steps (there one batch per ten episodes);
         8. uniformly random actions with a decreasing probability (``exploration_*``) instead of noise that falls from 1.0
            to 0.1 (``exploration_initial_noise=1.0`` and initial and final rate 0: the scripts);
         9. plain policy gradients; ``inverting_gradients=True`` for inverted ones; no clipping of gradient norms, no
@@ -60,7 +60,7 @@ class HyARTD3(HybridTD3):
     :param representation_learning_rate: learning rate of the representation
     :param representation_batch_size: its minibatch size
     :param representation_warmup_steps: its gradient steps before TD3 begins
-    :param representation_freq: it is updated again every ``representation_freq`` gradient steps of TD3
+    :param representation_freq: it is updated again before a call of ``train`` if TD3 has made so many gradient steps since
     :param representation_steps: number of its gradient steps then
     """
 

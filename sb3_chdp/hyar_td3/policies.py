@@ -33,7 +33,7 @@ class HyARTD3Policy(HybridTD3Policy):
         super().__init__(*args, **kwargs)
 
     def _build(self, lr_schedule: Schedule) -> None:
-        latent_dim = self.action_space.latent_dim
+        latent_dim = self.action_space.stored_latent_dim
         latent_space = spaces.Box(-1.0, 1.0, (latent_dim,), dtype=np.float32)
         self.actor_kwargs["action_space"] = self.critic_kwargs["action_space"] = latent_space
         super()._build(lr_schedule)
@@ -90,7 +90,7 @@ class HyARTD3Policy(HybridTD3Policy):
     ) -> th.Tensor:
         return self.decode(observation, self.actor(observation), action_masks)
 
-    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor, action_masks: th.Tensor | None = None) -> th.Tensor:
+    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor, action_masks: th.Tensor | None) -> th.Tensor:
         return self.decode(obs, (self.actor(obs) + noise).clamp(-1, 1), action_masks)
 
     def random_rows(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:

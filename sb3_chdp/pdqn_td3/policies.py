@@ -220,7 +220,7 @@ class PDQNTD3Policy(HybridTD3Policy):
         """:return: the outputs, parameters that leave the choice to the Q-networks"""
         return outputs
 
-    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor, action_masks: th.Tensor | None = None) -> th.Tensor:
+    def _noisy_rows(self, obs: PyTorchObs, noise: th.Tensor, action_masks: th.Tensor | None) -> th.Tensor:
         rows = self._predict(obs, action_masks=action_masks)
         # k is the best action for the parameters without noise
         parameters = self.action_space.columns.view(rows, "parameters")
