@@ -33,6 +33,7 @@ from sb3_chdp.zoo_arguments import (
     STOCK,
     ArgumentsError,
     check_env,
+    check_renders,
     complete,
     import_packages,
     option,
@@ -128,6 +129,8 @@ def run_script(command: str, arguments: list[str]) -> None:
             show_as(picture)
     elif command != "plot_from_file" and not HELP & set(arguments):
         check_env(option(arguments, "--env"))
+        if command == "record" or (command == "push_to_hub" and "--no-render" not in arguments):
+            check_renders(option(arguments, "--env") or "")
     if command == "enjoy" and "--no-render" not in arguments and not has_display():
         raise ArgumentsError("there is no display to show it on; --no-render gives numbers, sb3-chdp record a video")
     if command == "record":

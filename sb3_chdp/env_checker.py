@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import data_equivalence
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_chdp.common.checks import check_observation_space
+from sb3_chdp.common.checks import LARGEST, check_observation_space
 from sb3_chdp.common.masks import allowed_now
 from sb3_chdp.common.space_mismatch import mismatch
 from sb3_chdp.common.spaces import HybridActionSpec
@@ -103,6 +103,8 @@ class _Player:
         # Length of each random episode, and whether it ended by termination
         self.episodes: list[tuple[int, bool]] = []
         self.overwrites = False
+        # Of float64 observations by key: how often an entry changed, and how often in float32 too
+        self.changes: dict[str, np.ndarray] = {}
 
     def reset(self, **kwargs: Any) -> Any:
         """:return: the observation"""
@@ -150,6 +152,8 @@ class _Player:
         if terminated or truncated:
             self.n_ends += 1
             self.n_successes += "is_success" in info
+            if not isinstance(info.get("is_success", False), (bool, np.bool_, int, float)):
+                raise AssertionError(f"info['is_success'] must be True or False, got {info['is_success']!r}")
         # Monitor and EvalCallback, which read it at the end of episodes, fail when only some report it
         if self.n_successes not in (0, self.n_ends):
             raise AssertionError(
@@ -161,9 +165,10 @@ class _Player:
         if not isinstance(reward, (float, int)):
             what = f"The reward must be a float, got {reward!r} of type {type(reward).__name__}"
             raise AssertionError(f"{what}: return float(reward){self._hint_at_scalars(action)}")
-        if not np.isfinite(reward):
+        if not abs(reward) <= LARGEST:
             raise AssertionError(
-                f"The reward must be finite, got {reward} after {action}: look for a division by zero or an overflow"
+                f"The reward must be finite, and at most {LARGEST:.0e} in size, got {reward} after {action}: look for a "
+                "division by zero or an overflow"
             )
 
     def _hint_at_scalars(self, action: Any) -> str:
@@ -202,12 +207,21 @@ class _Player:
             kept, before = obs, deepcopy(obs)
             obs, _, terminated, truncated = self.step(self.spec.to_native(self._random_row(rng)))
             self.overwrites |= not data_equivalence(kept, before, exact=True)
+            self._count_changes(before, obs)
             length += 1
             if terminated or truncated:
                 self.episodes.append((length, terminated))
                 if len(self.episodes) == N_EPISODES:
                     break
                 obs, length = self.reset(), 0
+
+    def _count_changes(self, before: Any, obs: Any) -> None:
+        parts = obs if isinstance(obs, dict) else {"": obs}
+        for key, part in parts.items():
+            if isinstance(part, np.ndarray) and part.dtype == np.float64:
+                former = before[key] if key else before
+                changed = [part != former, part.astype(np.float32) != former.astype(np.float32)]
+                self.changes[key] = self.changes.get(key, 0) + np.array(changed)
 
     def _random_row(self, rng: np.random.Generator) -> np.ndarray:
         return self.spec.sample_rows(rng, 1, _call("action_masks()", allowed_now, self.env, self.spec))[0]
@@ -227,6 +241,14 @@ class _Player:
                 found.append(
                     f"All random episodes terminated after {length} steps: if that is a time limit, return truncated=True "
                     "and terminated=False there, so that the future after it counts"
+                )
+        for key, (in_float64, in_float32) in self.changes.items():
+            lost = np.argwhere(in_float32 < in_float64 / 2)
+            if len(lost):
+                name = f"observation[{key!r}]" if key else "observation"
+                found.append(
+                    f"{name} changes at {lost.tolist()} by less than float32 can hold, in which policies read it: subtract "
+                    "what is the same in all states"
                 )
         if self.overwrites:
             found.append("step() overwrites the observation that it returned before: return a copy, obs.copy()")

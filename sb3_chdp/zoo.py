@@ -12,8 +12,9 @@ from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 from rl_zoo3.utils import ALGOS
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3.common import callbacks
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, is_vecenv_wrapped
 
 import sb3_chdp
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
@@ -26,6 +27,7 @@ from sb3_chdp.zoo_arguments import ArgumentsError
 # Of a random episode, at whose end some environments say whether it was a success
 EXAMPLE_STEPS = 1000
 FLATTEN = "sb3_chdp.wrappers.FlattenHybridAction"
+TRANSPOSE = "stable_baselines3.common.vec_env.VecTransposeImage"
 
 
 def register() -> None:
@@ -109,12 +111,30 @@ class HybridExperimentManager(ExperimentManager):
         wanted = dict.fromkeys([*self.monitor_kwargs.get("info_keywords", ()), "is_success"])
         present = self._example[1]
         self.monitor_kwargs = {**self.monitor_kwargs, "info_keywords": tuple(key for key in wanted if key in present)}
-        return super().create_envs(n_envs, eval_env, no_log)
+        try:
+            return super().create_envs(n_envs, eval_env, no_log)
+        except NotImplementedError as error:  # nested observations
+            remedy = "-params env_wrapper:\"'gymnasium.wrappers.FlattenObservation'\""
+            raise ArgumentsError(f"{error}; what makes a vector of observations: {remedy}") from error
 
     def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
         if self.normalize:
+            # Before SB3 transposes images: replay buffers get them from VecNormalize
+            env = BaseAlgorithm._wrap_env(env)
             self.normalize_kwargs = {**_normalizable(env.observation_space), **self.normalize_kwargs}
         return super()._maybe_normalize(env, eval_env)
+
+    def _preprocess_action_noise(
+        self, hyperparams: dict[str, Any], saved_hyperparams: dict[str, Any], env: VecEnv
+    ) -> dict[str, Any]:
+        # The first method that gets both the environment and the arguments, those that enjoy will read among them
+        wrappers = saved_hyperparams.get("vec_env_wrapper") or []
+        if self.normalize and is_vecenv_wrapped(env, VecTransposeImage) and TRANSPOSE not in str(wrappers):
+            wrappers = [wrappers] if isinstance(wrappers, (str, dict)) else list(wrappers)
+            saved_hyperparams["vec_env_wrapper"] = [*wrappers, TRANSPOSE]
+        if hyperparams.get("policy") == "MlpPolicy" and "policy" not in (self.custom_hyperparams or {}):
+            hyperparams["policy"] = saved_hyperparams["policy"] = _policy_for(env.observation_space)
+        return super()._preprocess_action_noise(hyperparams, saved_hyperparams, env)
 
     @cached_property
     def _example(self) -> tuple[gym.Space[Any], dict[str, Any]]:
@@ -150,6 +170,13 @@ def _normalizable(space: gym.Space[Any]) -> dict[str, Any]:
         keys = [key for key, part in space.items() if is_vector(part)]
         return {"norm_obs_keys": keys} if keys else {"norm_obs": False}
     return {} if is_vector(space) else {"norm_obs": False}
+
+
+def _policy_for(space: gym.Space[Any]) -> str:
+    """:return: name of the policy that reads such observations"""
+    if isinstance(space, gym.spaces.Dict):
+        return "MultiInputPolicy"
+    return "CnnPolicy" if is_image_space(space) else "MlpPolicy"
 
 
 def _flatten(settings: dict[str, Any]) -> None:

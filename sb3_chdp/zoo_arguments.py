@@ -108,6 +108,19 @@ def check_env(env_id: str | None) -> None:
     raise ArgumentsError(unknown("environment", env_id, gym.registry, hint))
 
 
+def check_renders(env_id: str) -> None:
+    """
+    :param env_id: an environment that is registered
+    :raises ArgumentsError: if no video can be made of it
+    """
+    modes = gym.make(env_id).unwrapped.metadata.get("render_modes", [])
+    if "rgb_array" not in modes:
+        raise ArgumentsError(
+            f"{env_id} has the render modes {modes} in its metadata, and pictures need 'rgb_array'; push_to_hub does without "
+            "them if you say --no-render"
+        )
+
+
 def complete(command: str, arguments: list[str]) -> list[str]:
     """
     Name the run that was trained last, of those that fit, in the folder ``logs`` if the user names no other one.
@@ -123,17 +136,18 @@ def complete(command: str, arguments: list[str]) -> list[str]:
     if HELP & set(arguments) or (folder is not None and (is_plot or env is not None)):
         return arguments
     # Not the folders that a tuning leaves behind; those with checkpoints alone if the user asks for one
-    any_file = is_plot or any(argument.startswith("--load-") for argument in arguments)
+    any_file = any(argument.startswith("--load-") for argument in arguments)
     files = Path(folder or LOGS).glob(
         f"{(algo or '*').removeprefix(STOCK)}/{folder_name(env or '*')}_*/{'*.monitor.csv' if is_plot else '*.zip'}"
     )
     newest: tuple[float, Path] | None = None
     for file in files:
         env_name, _, number = file.parent.name.rpartition("_")
-        if number.isdigit() and (any_file or file.stem == env_name):
+        if number.isdigit() and (_has_episodes(file) if is_plot else any_file or file.stem == env_name):
             newest = max(newest or (0.0, file.parent), (file.stat().st_mtime, file.parent))
     if newest is None:
-        words = ["no", "" if any_file else "finished", "run", f"of {algo}" if algo else "", f"on {env}" if env else "", "in"]
+        kind = "run with a finished episode" if is_plot else "run" if any_file else "finished run"
+        words = ["no", kind, f"of {algo}" if algo else "", f"on {env}" if env else "", "in"]
         raise ArgumentsError(f"{' '.join(filter(None, words))} {folder or LOGS}; -f names another folder")
     run = newest[1]
     env_name, _, number = run.name.rpartition("_")
@@ -145,6 +159,12 @@ def complete(command: str, arguments: list[str]) -> list[str]:
     if names.exp_id and option(arguments, *names.exp_id) is None:
         added += [names.exp_id[0], number]
     return [*added, *arguments]
+
+
+def _has_episodes(monitor: Path) -> bool:
+    # Behind a line of JSON and the names of the columns
+    with monitor.open() as file:
+        return sum(1 for _ in zip(range(3), file, strict=False)) == 3
 
 
 def with_folder_names(arguments: list[str]) -> list[str]:

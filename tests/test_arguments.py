@@ -11,7 +11,6 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_chdp import CHDP, HPPO, PDQNTD3, HyARTD3
 from sb3_chdp.common.arguments import constructor_defaults
-from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from tests.algorithms import ALGORITHMS, OFF_POLICY, make_model
 from tests.hybrid_envs import box, make_layout_env
 
@@ -40,6 +39,8 @@ BAD = {
     "gradient_steps": [-7, 1.5, *NO_NUMBER],
     "optimize_memory_usage": SWITCH,
     "policy_delay": COUNT,
+    "action_noise": [0.1, "normal"],
+    "replay_buffer_class": ["ReplayBuffer", dict],
     "exploration_fraction": FRACTION,
     "exploration_initial_eps": [2, *FRACTION],
     "exploration_final_eps": [2, *FRACTION],
@@ -77,7 +78,7 @@ BAD = {
 }
 # Objects, whose classes check them
 UNCHECKED = {
-    "policy", "env", "action_noise", "replay_buffer_class", "replay_buffer_kwargs", "rollout_buffer_class", "passthrough",
+    "policy", "env", "replay_buffer_kwargs", "rollout_buffer_class", "passthrough",
     "rollout_buffer_kwargs", "tensorboard_log", "policy_kwargs", "verbose", "_init_setup_model",
 }  # fmt: skip
 
@@ -177,7 +178,7 @@ def test_arguments_of_the_algorithm_in_policy_kwargs(algorithm, name, value):
 
 
 OTHERS: dict[str, dict[str, Any]] = {
-    "class": dict(replay_buffer_class=PrioritizedReplayBuffer),
+    "class": dict(replay_buffer_class=NStepReplayBuffer, replay_buffer_kwargs=dict(n_steps=2, gamma=0.9)),
     "observation_space": dict(env=make_layout_env(observation_space=box(-2, 2, 2))),
     "action_space": dict(env=make_layout_env("flat")),
     "n_envs": dict(env=make_vec_env(make_layout_env, 2)),

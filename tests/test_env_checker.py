@@ -57,7 +57,7 @@ def walk(**changes):
 
 def observing(space, value=None):
     """:return: the walk with other observations, samples of the space if no value is given"""
-    return walk(observation_space=space, observation=lambda self: space.sample() if value is None else value)
+    return walk(observation_space=space, observation=(lambda self: space.sample()) if value is None else value)
 
 
 def old_reset(self):
@@ -146,7 +146,9 @@ ERRORS = {
     ),
     "reward_of_numpy": (lambda: walk(reward=np.float32(1)), "The reward must be a float, got np.float32(1.0) of type float32"),
     "reward_none": (lambda: walk(reward=None), "The reward must be a float, got None of type NoneType: return float(reward)"),
-    "reward_infinite": (lambda: walk(reward=-np.inf), "The reward must be finite, got -inf after"),
+    "reward_infinite": (lambda: walk(reward=-np.inf), "The reward must be finite, and at most 1e+15 in size, got -inf"),
+    "reward_too_large": (lambda: walk(reward=-1e16), "at most 1e+15 in size, got -1e+16 after"),
+    "success_in_words": (lambda: walk(info={"is_success": "yes"}), "info['is_success'] must be True or False, got 'yes'"),
     "terminated": (lambda: walk(terminated=np.bool_(False)), "terminated must be a bool, got np.False_: return bool("),
     "truncated": (lambda: walk(truncated=0), "truncated must be a bool, got 0: return bool(truncated)"),
     "info": (lambda: walk(info=None), "The info of step() must be a dict, got None: return {} if there is nothing to say"),
@@ -189,6 +191,10 @@ WARNINGS = {
     "other_generator": (
         lambda: walk(observation=lambda self: np.random.uniform(-1, 1, 2).astype(np.float32)),
         "Two runs with reset(seed=1) and the same actions differ",
+    ),
+    "clock": (
+        lambda: observing(spaces.Box(0, np.inf, (2,), np.float64), lambda self: np.array([self.t, 1.7e9 + self.t])),
+        "observation changes at [[1]] by less than float32 can hold, in which policies read it: subtract",
     ),
     "overwritten": (lambda: walk(observation=one_array), "overwrites the observation that it returned before: return a copy"),
 }

@@ -20,11 +20,12 @@ from stable_baselines3.common.vec_env import (
     VecFrameStack,
     VecMonitor,
     VecNormalize,
+    VecTransposeImage,
 )
 
 from sb3_chdp import CHDP, PATD3, FlattenHybridAction, HyARTD3, check_hybrid_env
 from tests.algorithms import LAYOUTS, OFF_POLICY_ALGORITHMS, has_learnt, make_model, snapshot
-from tests.hybrid_envs import LayoutEnv, box, make_layout_env
+from tests.hybrid_envs import LayoutEnv, box, layouts, make_layout_env
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -244,8 +245,59 @@ def test_unknown_policy_kwargs(algorithm):
 
 @pytest.mark.parametrize("space", [box(-1, 1, 2), spaces.Discrete(3)])
 def test_actions_that_are_not_hybrid(algorithm, space):
-    with pytest.raises(AssertionError, match="only supports"):
+    with pytest.raises(ValueError, match=r"env\.action_space must be a Tuple, Dict or OneOf of a discrete choice"):
         make_model(algorithm, LayoutEnv(space))
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [(LayoutEnv, r"got the class LayoutEnv: give an object of it, LayoutEnv\(\)"), (3, "got 3")],
+    ids=str,
+)
+def test_what_is_no_environment(algorithm, env, message):
+    with pytest.raises(ValueError, match=f"env must be an environment.*{message}"):
+        make_model(algorithm, env)
+
+
+def test_environments_by_name(algorithm, tmp_path):
+    model = make_model(algorithm, "HardMove4-v0")
+    model.save(tmp_path / "model")
+    algorithm.load(tmp_path / "model", env="HardMove4-v0").set_env("HardMove4-v0")
+    with pytest.raises(ValueError, match=r"env must be an environment.*got None"):
+        model.set_env(None)
+
+
+def test_policies_that_do_not_fit(algorithm):
+    with pytest.raises(ValueError, match=r"policy must be one of .*'MlpPolicy'.*got 'MlpPolcy'"):
+        make_model(algorithm, make_layout_env(), "MlpPolcy")
+    with pytest.raises(ValueError, match=r"policy must be 'MlpPolicy', or 'CnnPolicy' for images, .*got \w*MultiInputPolicy"):
+        make_model(algorithm, make_layout_env(), "MultiInputPolicy")
+    with pytest.raises(ValueError, match=r"policy_kwargs\['activation_fn'\] must be a class, got 'relu'"):
+        make_model(algorithm, make_layout_env(), policy_kwargs=dict(activation_fn="relu"))
+    with pytest.raises(ValueError, match=r"policy_kwargs must be a dict, or None, got \[1\]"):
+        make_model(algorithm, make_layout_env(), policy_kwargs=[1])
+
+
+@pytest.mark.parametrize("steps", ["100", -5, float("nan")])
+def test_numbers_of_steps_that_are_none(algorithm, steps):
+    with pytest.raises(ValueError, match="total_timesteps must be a finite number of at least 0, got"):
+        make_model(algorithm, make_layout_env()).learn(steps)
+
+
+def test_a_training_without_a_gradient_step_says_so(off_policy_algorithm):
+    with pytest.warns(UserWarning, match="Nothing is learnt yet: the first learning_starts=12 steps are random"):
+        make_model(off_policy_algorithm, make_layout_env()).learn(10)
+
+
+def test_normalization_around_transposed_images(off_policy_algorithm):
+    class Camera(LayoutEnv):
+        def __init__(self):
+            super().__init__(layouts()["shared"], spaces.Box(0, 255, (36, 36, 1), np.uint8))
+
+    env = DummyVecEnv([Camera])
+    with pytest.raises(ValueError, match=r"env must be VecNormalize\(VecTransposeImage\(env\)\)"):
+        make_model(off_policy_algorithm, VecNormalize(env, norm_obs=False), "CnnPolicy")
+    make_model(off_policy_algorithm, VecNormalize(VecTransposeImage(env), norm_obs=False), "CnnPolicy").learn(20)
 
 
 def test_unbounded_parameters(algorithm):

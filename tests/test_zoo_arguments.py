@@ -3,10 +3,12 @@
 import os
 import re
 
+import gymnasium as gym
 import pytest
 
 from sb3_chdp.cli import COMMANDS, prepare_arguments
-from sb3_chdp.zoo_arguments import ArgumentsError, check_env, complete, import_packages, option, split_option
+from sb3_chdp.zoo_arguments import ArgumentsError, check_env, check_renders, complete, import_packages, option, split_option
+from tests.hybrid_envs import make_layout_env
 
 
 @pytest.fixture
@@ -18,11 +20,13 @@ def logs(tmp_path, monkeypatch):
         run = tmp_path / "logs" / os.path.dirname(name)
         run.mkdir(parents=True)
         # The last run is not finished
-        (run / "0.monitor.csv").touch()
         for file in [run / "0.monitor.csv", run / (os.path.basename(name) or "rl_model_5_steps")]:
             file = file.with_suffix(file.suffix or ".zip")
-            file.touch()
+            file.write_text("#{}\nr,l,t\n1,1,1\n" if file.suffix == ".csv" else "")
             os.utime(file, (age, age))
+    # The environment broke at once
+    (tmp_path / "logs/chdp/Broken-v0_1").mkdir()
+    (tmp_path / "logs/chdp/Broken-v0_1/0.monitor.csv").write_text("#{}\nr,l,t\n")
 
 
 @pytest.mark.parametrize(
@@ -50,7 +54,7 @@ def test_the_last_run(logs, command, arguments, added):
     [
         ("enjoy", "--algo pa_td3", "no finished run of pa_td3 in logs; -f names another folder"),
         ("record", "--env sb3_chdp/Platform-v0", "no finished run on sb3_chdp/Platform-v0 in logs"),
-        ("plot", "--env Other-v0", "no run on Other-v0 in logs"),
+        ("plot", "--env Other-v0", "no run with a finished episode on Other-v0 in logs"),
         ("enjoy", "--folder elsewhere", "no finished run in elsewhere"),
     ],
 )
@@ -92,6 +96,13 @@ def test_unknown_environment(env_id, message):
 def test_known_environment():
     check_env("Platform-v0")
     check_env("sb3_chdp/Platform-v0")
+
+
+def test_environments_without_pictures():
+    check_renders("Platform-v0")
+    gym.register("Dark-v0", make_layout_env)
+    with pytest.raises(ArgumentsError, match=r"Dark-v0 has the render modes \[\] .* pictures need 'rgb_array'"):
+        check_renders("Dark-v0")
 
 
 def test_modules(tmp_path, monkeypatch):

@@ -71,6 +71,38 @@ def test_observations_that_cannot_be_normalized(tmp_path):
         "-params", "n_steps:5", "batch_size:10", cwd=tmp_path)  # fmt: skip
 
 
+CAMERA_ENV = """
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from tests.hybrid_envs import LayoutEnv, layouts
+
+CAMERA = spaces.Box(0, 255, (36, 36, 1), np.uint8)
+VECTOR = spaces.Box(-1, 1, (2,))
+gym.register("Camera-v0", lambda: LayoutEnv(layouts()["shared"], CAMERA))
+gym.register("Both-v0", lambda: LayoutEnv(layouts()["shared"], spaces.Dict(camera=CAMERA, gps=VECTOR)))
+gym.register("Nested-v0", lambda: LayoutEnv(layouts()["shared"], spaces.Dict(a=spaces.Dict(b=VECTOR))))
+"""
+
+
+@pytest.mark.parametrize(("algo", "env"), [("chdp", "Both-v0"), ("pa_td3", "Camera-v0"), ("pa_td3", "Both-v0")])
+def test_the_policy_follows_from_the_observations(algo, env, tmp_path):
+    """Within VecNormalize, too, which the settings of pa_td3 ask for."""
+    (tmp_path / "cameras.py").write_text(CAMERA_ENV)
+    run("train", "--algo", algo, "--env", env, "--gym-packages", "cameras", "-n", "30", "--eval-freq", "20",
+        "--eval-episodes", "1", "-params", "learning_starts:10", "buffer_size:100", "batch_size:4", cwd=tmp_path)  # fmt: skip
+    run("enjoy", "--gym-packages", "cameras", "--no-render", "-n", "20", cwd=tmp_path)
+
+
+def test_nested_observations_need_a_wrapper(tmp_path):
+    (tmp_path / "cameras.py").write_text(CAMERA_ENV)
+    arguments = ["train", "--env", "Nested-v0", "--gym-packages", "cameras", "-n", "20", "-params", "learning_starts:100"]
+    wrapper = "env_wrapper:'gymnasium.wrappers.FlattenObservation'"
+    assert f'-params env_wrapper:"{wrapper.partition(":")[2]}"' in run(*arguments, cwd=tmp_path, code=1)
+    run(*arguments, wrapper, cwd=tmp_path)
+
+
 MASKED_ENV = """
 import gymnasium as gym
 import numpy as np

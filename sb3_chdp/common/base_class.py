@@ -9,8 +9,9 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from sb3_contrib.common.maskable.utils import is_masking_supported
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.common.vec_env import VecCheckNan, VecEnv, is_vecenv_wrapped
@@ -31,7 +32,7 @@ from sb3_chdp.common.arguments import (
     optional,
     whole,
 )
-from sb3_chdp.common.checks import check_observation_space, check_policy_kwargs
+from sb3_chdp.common.checks import check_is_env, check_observation_space, check_policy_kwargs
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.masks import env_masks
 from sb3_chdp.common.native_env import NativeActionVecEnv, uncounted_if_refused
@@ -76,11 +77,19 @@ class HybridAlgorithm(BaseAlgorithm):
     _native_env: NativeActionVecEnv | None = None
 
     @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+    def _wrap_env(env: GymEnv | str, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        # load() and set_env() do not take ids in SB3
+        env = maybe_make_env(env, verbose)
+        check_is_env(env)
         # SB3 converts the spaces of the old gym
         if isinstance(env.observation_space, spaces.Space):
             check_observation_space(env.observation_space)
         vec_env = BaseAlgorithm._wrap_env(env, verbose, monitor_wrapper)
+        if not isinstance(vec_env.action_space, HYBRID_SPACES):
+            raise ValueError(
+                f"env.action_space must be a Tuple, Dict or OneOf of a discrete choice and its parameters, got "
+                f"{vec_env.action_space}: take an algorithm of SB3's for it, or leave out FlattenHybridAction"
+            )
         if is_vecenv_wrapped(vec_env, VecCheckNan):
             raise ValueError(
                 "VecCheckNan can not look into hybrid actions, leave it out: training stops with an error at the first "
@@ -154,12 +163,22 @@ class HybridAlgorithm(BaseAlgorithm):
         """:return: arguments of the algorithm that shape its networks, handed to the policy beside ``policy_kwargs``"""
         return {}
 
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        check(one_of(self.policy_aliases), policy=policy_name)
+        return super()._get_policy_from_name(policy_name)
+
     def _setup_model(self) -> None:
         check_arguments(self)
+        takes_dicts = issubclass(self.policy_class, self.policy_aliases.get("MultiInputPolicy", ()))
+        if takes_dicts and not isinstance(self.observation_space, spaces.Dict):
+            raise ValueError(
+                f"policy must be 'MlpPolicy', or 'CnnPolicy' for images, for observations in {self.observation_space}, got "
+                f"{self.policy_class.__name__}, which takes a Dict of them"
+            )
+        check_policy_kwargs(self.policy_class, self.policy_kwargs)
         of_algorithm = self._network_kwargs()
         for name in self.policy_kwargs.keys() & of_algorithm.keys():
             raise ValueError(f"policy_kwargs must not have {name!r}: it is an argument of {type(self).__name__} itself")
-        check_policy_kwargs(self.policy_class, self.policy_kwargs)
         native_space, policy_kwargs = self.action_space, self.policy_kwargs
         self.hybrid_space = self._make_rows()
         # Buffer and policy are built for the rows; the model keeps the user's space
@@ -217,11 +236,12 @@ class HybridAlgorithm(BaseAlgorithm):
         update_learning_rate(optimizer, rate)
         self.logger.record(f"train/{name}", rate)
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+    def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        check(number(), total_timesteps=total_timesteps)
         if self.use_masking and self.env is not None and not is_masking_supported(self.env):
             raise ValueError("use_masking is True but the environment has no method action_masks()")
         with uncounted_if_refused(self._vec_normalize_env):
-            total_timesteps, callback = super()._setup_learn(*args, **kwargs)
+            total_timesteps, callback = super()._setup_learn(total_timesteps, *args, **kwargs)
             assert self.env is not None, "You must set the environment before calling learn()"
             try:
                 self.native_env(self.env).check_observations(self._last_obs)

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, unwrap_vec_normalize
 
 from sb3_chdp.common.arguments import constructor_defaults
 from sb3_chdp.common.space_tree import leaves_of
@@ -42,6 +43,29 @@ def check_numbers(name: str, value: Any, first_env: int = 0) -> None:
         )
 
 
+def check_is_env(env: Any) -> None:
+    """
+    :param env: argument of an algorithm
+    :raises ValueError: if it is no environment
+    """
+    if isinstance(env, type):
+        raise ValueError(f"env must be an environment, got the class {env.__name__}: give an object of it, {env.__name__}()")
+    if not hasattr(env, "observation_space"):
+        raise ValueError(f"env must be an environment of Gymnasium's, a VecEnv of SB3's, or an id, got {env!r}")
+
+
+def check_replayed_images(env: VecEnv | None) -> None:
+    """
+    :param env: the environment of an algorithm with a replay buffer
+    :raises ValueError: if images are transposed around ``VecNormalize``, which hands what it got to the buffer
+    """
+    if isinstance(env, VecTransposeImage) and unwrap_vec_normalize(env) is not None:
+        raise ValueError(
+            "env must be VecNormalize(VecTransposeImage(env)), so that the replay buffer gets images as the policy does, got "
+            "VecNormalize around images whose channels come last"
+        )
+
+
 def check_observation_space(space: spaces.Space[Any]) -> None:
     """
     :param space: the observation space of an environment
@@ -69,11 +93,16 @@ def check_observation_space(space: spaces.Space[Any]) -> None:
 
 def check_policy_kwargs(policy_class: type, policy_kwargs: dict[str, Any]) -> None:
     """
-    :raises ValueError: if the policy has no such argument; the message lists those it has
+    :raises ValueError: if the policy has no such argument, where the message lists those it has, and for the name of a class
     """
+    if not isinstance(policy_kwargs, dict):
+        raise ValueError(f"policy_kwargs must be a dict, or None, got {policy_kwargs!r}")
     accepted = {*constructor_defaults(policy_class)} - {"observation_space", "action_space", "lr_schedule", "self"}
     unknown = set(policy_kwargs) - accepted
     if unknown:
         raise ValueError(
             f"policy_kwargs has unknown key(s) {sorted(unknown)}; {policy_class.__name__} accepts {sorted(accepted)}"
         )
+    for name, value in policy_kwargs.items():
+        if name.endswith(("_fn", "_class")) and not callable(value):
+            raise ValueError(f"policy_kwargs[{name!r}] must be a class, got {value!r}")

@@ -16,10 +16,10 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_chdp.common.arguments import FRACTION, SWITCH, TRAIN_FREQ, Accepted, check_device, whole
+from sb3_chdp.common.arguments import FRACTION, SWITCH, TRAIN_FREQ, Accepted, check_device, optional, whole
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.buffer_file import check_buffer, load_buffer, save_buffer
-from sb3_chdp.common.checks import check_numbers
+from sb3_chdp.common.checks import check_numbers, check_replayed_images
 from sb3_chdp.common.masks import INFO_KEY, read_masks
 from sb3_chdp.common.n_step_buffer import HybridNStepReplayBuffer, end_trajectories
 from sb3_chdp.common.policies import HybridPolicy
@@ -52,6 +52,10 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         "gradient_steps": whole(-1),
         "optimize_memory_usage": SWITCH,
         "policy_delay": whole(1),
+        "action_noise": optional(Accepted("an ActionNoise of SB3's", lambda value: isinstance(value, ActionNoise))),
+        "replay_buffer_class": optional(
+            Accepted("a class of replay buffers", lambda value: isinstance(value, type) and issubclass(value, ReplayBuffer))
+        ),
     }
     policy: HybridPolicy
 
@@ -108,6 +112,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
             supported_action_spaces=HYBRID_SPACES,
             support_multi_env=True,
         )
+        check_replayed_images(self.env)
         self.action_layout = action_layout
         self.use_masking = self._resolve_masking(use_masking)
 
@@ -156,7 +161,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> SelfHybridOffPolicyAlgorithm:
         """SB3's ``learn``; the name of the tensorboard log is by default that of the class."""
-        return super().learn(
+        super().learn(
             total_timesteps=total_timesteps,
             callback=callback,
             log_interval=log_interval,
@@ -164,6 +169,12 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
+        if self._n_updates == 0 and self.num_timesteps <= self.learning_starts:
+            warnings.warn(
+                f"Nothing is learnt yet: the first learning_starts={self.learning_starts} steps are random, and training "
+                f"ended after {self.num_timesteps}"
+            )
+        return self
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """

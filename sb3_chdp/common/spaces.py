@@ -65,7 +65,10 @@ class HybridActionSpec:
                 raise ValueError(f"action_layout={layout!r} does not apply to a OneOf space, whose parts exclude each other")
             for i, option in enumerate(space.spaces):
                 if not is_parameter_space(option):
-                    raise ValueError(f"action_space.spaces[{i}] of a OneOf must hold Box spaces only, got {option}")
+                    raise ValueError(
+                        f"action_space.spaces[{i}] of a OneOf must hold Box spaces only, or be Discrete(1) for no "
+                        f"parameters, got {option}"
+                    )
             self._discrete_leaves: list[DiscreteLeaf] = []
             options: list[tuple[Path, spaces.Space[Any]]] = [(("option",), option) for option in space.spaces]
             self.is_shared = False
