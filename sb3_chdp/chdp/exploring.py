@@ -48,12 +48,7 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         self._claims: Claims | None = None
 
     def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
+        self, total_timesteps: int, callback: MaybeCallback = None, reset_num_timesteps: bool = True, *args: Any, **kwargs: Any
     ) -> tuple[int, BaseCallback]:
         self._claims = None
         if reset_num_timesteps or self._last_obs is None:
@@ -61,7 +56,7 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
             self.returns_so_far = []
         if reset_num_timesteps:
             self.n_informative_steps, self.return_sums = 0.0, ReturnSums()
-        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
 
     def _state_parts(self) -> tuple[str, ...]:
         kind = self.replay_buffer_class
