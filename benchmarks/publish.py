@@ -78,8 +78,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--print", action="store_true", dest="only_print")
     args = parser.parse_args()
-    protocol = {table: paper.describe_cells(RESULTS, table) for table in (MAIN, *TABLES)}
-    today = one_setting(yaml_order(paper.describe_cells(RESULTS, ONE_SETTING)), scores_of(read_results(RESULTS / ONE_SETTING)))
+    protocol = {table: paper.describe_cells(RESULTS, table) for table in (MAIN, ONE_SETTING, *TABLES)}
+    today = one_setting(yaml_order(protocol[ONE_SETTING]), scores_of(read_results(RESULTS / ONE_SETTING)))
     results = read_results(RESULTS / MAIN)
     scores = scores_of(results)
     envs = tables.order(scores["env"], [cell["environment"] for cell in yaml_order(protocol[MAIN])])

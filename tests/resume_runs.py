@@ -121,6 +121,7 @@ def train(folder, name, moments):
     env = make_env(n_envs, folder / "monitor", normalize=normalize)
     eval_env = make_env(1, normalize=normalize, seed=77)
     kwargs = dict(RUNS[name])
+    with_noise = kwargs.pop("action_noise", False)
     if algorithm != "HPPO":
         kwargs["buffer_size"] = BUFFER_SIZE
     try:
@@ -129,7 +130,7 @@ def train(folder, name, moments):
     except FileNotFoundError:
         resumed_at = 0
         model = make_model(getattr(sb3_chdp, algorithm), env, device="cpu", **kwargs)
-        if "action_noise" in kwargs:
+        if with_noise:
             size = model.policy.noise_dim
             model.action_noise = OrnsteinUhlenbeckActionNoise(np.zeros(size), np.full(size, 0.3))
     model.set_logger(configure(str(folder / "log"), ["csv", "json"]))

@@ -18,7 +18,7 @@ from sb3_chdp.benchmark.runs import Run
 
 PROTOCOL = Path(__file__).with_name("protocol.yml")
 PAPER = Path(__file__).with_name("paper.yml")
-# The table of the algorithms; the others are ablations
+# The table of the algorithms; the others are CHDP with its one setting, and ablations
 MAIN = "main"
 EVAL_EPISODES = 100
 COMMIT_DIGITS = 12
