@@ -128,10 +128,8 @@ class HybridExperimentManager(ExperimentManager):
         self, hyperparams: dict[str, Any], saved_hyperparams: dict[str, Any], env: VecEnv
     ) -> dict[str, Any]:
         # The first method that gets both the environment and the arguments, those that enjoy will read among them
-        wrappers = saved_hyperparams.get("vec_env_wrapper") or []
-        if self.normalize and is_vecenv_wrapped(env, VecTransposeImage) and TRANSPOSE not in str(wrappers):
-            wrappers = [wrappers] if isinstance(wrappers, (str, dict)) else list(wrappers)
-            saved_hyperparams["vec_env_wrapper"] = [*wrappers, TRANSPOSE]
+        if self.normalize and is_vecenv_wrapped(env, VecTransposeImage):
+            _add_wrapper(saved_hyperparams, "vec_env_wrapper", TRANSPOSE)
         if hyperparams.get("policy") == "MlpPolicy" and "policy" not in (self.custom_hyperparams or {}):
             hyperparams["policy"] = saved_hyperparams["policy"] = _policy_for(env.observation_space)
         return super()._preprocess_action_noise(hyperparams, saved_hyperparams, env)
@@ -179,10 +177,15 @@ def _policy_for(space: gym.Space[Any]) -> str:
     return "CnnPolicy" if is_image_space(space) else "MlpPolicy"
 
 
+def _add_wrapper(settings: dict[str, Any], key: str, wrapper: str) -> None:
+    """Put a wrapper around those that the settings name, unless it is one of them."""
+    wrappers = settings.get(key) or []
+    wrappers = [wrappers] if isinstance(wrappers, (str, dict)) else list(wrappers)
+    if wrapper not in str(wrappers):
+        settings[key] = [*wrappers, wrapper]
+
+
 def _flatten(settings: dict[str, Any]) -> None:
     """Wrap the environment, and normalise as the algorithms of this package do unless told otherwise."""
-    wrappers = settings.get("env_wrapper") or []
-    wrappers = [wrappers] if isinstance(wrappers, (str, dict)) else list(wrappers)
-    if not any(FLATTEN in str(wrapper) for wrapper in wrappers):
-        settings["env_wrapper"] = [*wrappers, FLATTEN]
+    _add_wrapper(settings, "env_wrapper", FLATTEN)
     settings.setdefault("normalize", True)

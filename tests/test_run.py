@@ -296,7 +296,7 @@ def test_normalization_around_transposed_images(off_policy_algorithm):
 
     env = DummyVecEnv([Camera])
     with pytest.raises(ValueError, match=r"env must be VecNormalize\(VecTransposeImage\(env\)\)"):
-        make_model(off_policy_algorithm, VecNormalize(env, norm_obs=False), "CnnPolicy")
+        make_model(off_policy_algorithm, VecNormalize(env, norm_obs=False), "CnnPolicy").learn(20)
     make_model(off_policy_algorithm, VecNormalize(VecTransposeImage(env), norm_obs=False), "CnnPolicy").learn(20)
 
 

@@ -101,6 +101,8 @@ def test_known_environment():
 def test_environments_without_pictures():
     check_renders("Platform-v0")
     gym.register("Dark-v0", make_layout_env)
+    gym.register("WithArguments-v0", "tests.hybrid_envs:LayoutEnv")
+    check_renders("WithArguments-v0")
     with pytest.raises(ArgumentsError, match=r"Dark-v0 has the render modes \[\] .* pictures need 'rgb_array'"):
         check_renders("Dark-v0")
 

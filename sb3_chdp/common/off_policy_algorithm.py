@@ -112,7 +112,6 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
             supported_action_spaces=HYBRID_SPACES,
             support_multi_env=True,
         )
-        check_replayed_images(self.env)
         self.action_layout = action_layout
         self.use_masking = self._resolve_masking(use_masking)
 
@@ -230,6 +229,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
     def _setup_learn(
         self, total_timesteps: int, callback: MaybeCallback = None, reset_num_timesteps: bool = True, *args: Any, **kwargs: Any
     ) -> tuple[int, BaseCallback]:
+        check_replayed_images(self.env)
         if self.replay_buffer is not None and (reset_num_timesteps or self._last_obs is None):
             end_trajectories(self.replay_buffer)  # the environment is reset
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
