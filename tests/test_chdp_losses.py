@@ -8,6 +8,7 @@ from torch.nn import functional as F
 
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import PaperCHDP, losses
+from sb3_chdp.common.utils import gradient_step
 from tests.algorithms import calls_of, filled_model, sample
 
 BOTH = pytest.mark.parametrize("algorithm_class", [CHDP, PaperCHDP])
@@ -35,14 +36,13 @@ def networks_with_gradient(model, loss):
     return result
 
 
-def all_losses(model, parameters="drawn"):
+def all_losses(model):
     data, policy = sample(model), model.policy
     features = policy.critic.features(data.observations)
     targets = policy.in_units_of_critics(losses.target_values(policy, data))
     critic, *_ = losses.critic_loss(policy, data, features, targets[:, :1])
     features = features.detach()
-    stored = data.parameters if parameters == "stored" else None
-    discrete = losses.discrete_policy_loss(policy, data, features, stored)
+    discrete = model._discrete_policy_loss(data, features)
     with th.no_grad():
         latents, k = policy.actor.sample_latents(features)
     continuous = losses.continuous_policy_loss(policy, data, features, latents, k)
@@ -60,18 +60,19 @@ def all_losses(model, parameters="drawn"):
 GRADIENTS = {
     "critic": {"critic", "codebook"},
     "discrete diffusion": {"discrete"},
-    "discrete improvement": {"discrete", "critic"},
+    "discrete improvement": {"discrete"},
     "continuous diffusion": {"continuous"},
     "continuous improvement": {"continuous", "codebook", "critic"},
 }
 
 
-@pytest.mark.parametrize("parameters", ["drawn", "stored"])
 @BOTH
 @pytest.mark.parametrize("loss", GRADIENTS)
-def test_gradient_routing(loss, algorithm_class, parameters):
+def test_gradient_routing(loss, algorithm_class):
     model = filled_model(algorithm_class=algorithm_class)
-    assert networks_with_gradient(model, all_losses(model, parameters)[loss]) == GRADIENTS[loss]
+    # The paper's latents are improved by the critics' gradient
+    extra = {"critic"} if algorithm_class is PaperCHDP and loss == "discrete improvement" else set()
+    assert networks_with_gradient(model, all_losses(model)[loss]) == GRADIENTS[loss] | extra
 
 
 @BOTH
@@ -120,21 +121,79 @@ def test_continuous_step_sees_the_updated_discrete_policy(algorithm_class):
     assert not th.equal(weights[1 + n], weights[0])
 
 
-@pytest.mark.parametrize("parameters", ["drawn", "stored"])
-def test_parameters_with_which_latents_are_valued(parameters):
+def test_discrete_actions_are_compared_with_parameters_of_their_own(monkeypatch):
+    """The nearest, the stored and two other discrete actions, each with parameters that the continuous policy draws for it."""
     model = filled_model()
     data, actor = sample(model), model.actor
     features = model.critic.features(data.observations)
-    stored = data.parameters if parameters == "stored" else None
+    valued, drawn_for = calls_of(model.critic.q_networks[0]), []
+    draw = actor.sample_parameters
+
+    def record(features, k):
+        drawn_for.append((k, draw(features, k)))
+        return drawn_for[-1][1]
+
+    monkeypatch.setattr(actor, "sample_parameters", record)
+    losses.discrete_policy_loss(model.policy, data, features)
+    ((k, parameters),) = drawn_for
+    ((_, latents, seen_parameters),) = valued
+    assert th.equal(seen_parameters, parameters)
+    assert th.equal(latents, actor.codebook.representative_latents(k))
+    assert th.equal(k.view(-1, 2 + losses.N_COMPARED)[:, 1], data.discrete_actions)
+
+
+def test_stored_parameters_value_the_latents_of_the_paper():
+    model = filled_model(algorithm_class=PaperCHDP)
+    data = sample(model)
+    features = model.critic.features(data.observations)
     calls = calls_of(model.critic.q_networks[0])
     th.manual_seed(0)
-    losses.discrete_policy_loss(model.policy, data, features, stored)
+    model._discrete_policy_loss(data, features)
     th.manual_seed(0)
-    latents, k = actor.sample_latents(features)
-    expected = data.parameters if parameters == "stored" else actor.sample_parameters(features, k)
+    latents, _ = model.actor.sample_latents(features)
     ((_, seen_latents, seen_parameters),) = calls
     th.testing.assert_close(seen_latents, latents.detach())
-    th.testing.assert_close(seen_parameters, expected.detach())
+    th.testing.assert_close(seen_parameters, data.parameters)
+
+
+def test_soft_quantization():
+    """Near codewords weigh more, those that do not compete nothing, and none is too far to be seen from another one."""
+    codewords = th.tensor([[[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [1.0, 1.0]]])
+    latents = th.tensor([[0.9, 1.0]], requires_grad=True)
+    competes = losses.first_occurrences(th.tensor([[2, 1, 0, 2]]))
+    assert competes.tolist() == [[True, True, True, False]]
+    weights = losses.soft_quantization(latents, codewords, competes)
+    assert weights[0, 0] > weights[0, 1] > weights[0, 2] > 0.05 and weights[0, 3] == 0
+    assert weights.sum().item() == pytest.approx(1)
+    # What is worth more draws the latent towards it
+    values = th.tensor([[0.0, 0.0, 1.0, 0.0]])
+    (gradient,) = th.autograd.grad((weights * values).sum(), latents)
+    assert (gradient < 0).all()
+
+
+def test_equal_actions_of_a_factored_space_compete_once():
+    k = th.tensor([[[0, 1], [1, 1], [0, 1]]])
+    assert losses.first_occurrences(k).tolist() == [[True, True, False]]
+
+
+def test_the_discrete_policy_learns_which_action_is_best():
+    """Of three actions the second is worth more, wherever the gradient of Q at the codewords points."""
+    model = filled_model()
+    policy, actor = model.policy, model.actor
+    data = sample(model)
+    features = policy.critic.features(data.observations).detach()
+    codewords = actor.codebook.codewords.detach()
+
+    def score(_, latents, *__):
+        return (latents[:, None] == codewords[1]).all(dim=2).float()
+
+    policy.critic.score1 = score
+    for _ in range(150):
+        diffusion_loss, q_loss = losses.discrete_policy_loss(policy, data, features)
+        gradient_step(diffusion_loss + 30 * q_loss, [policy.discrete_optimizer], 1.0)
+    with th.no_grad():
+        _, k = actor.sample_latents(features)
+    assert (k == 1).float().mean() > 0.9
 
 
 @BOTH

@@ -56,19 +56,29 @@ class CooperativeActor(nn.Module):
         """:return: (B, Pmax) 1 for the parameters that action k has, None if no action has padding"""
         return self.parameter_mask[k] if self._has_padding else None
 
-    def sample_latents(
+    def draw_latents(
         self, features: th.Tensor, noise: th.Tensor | None = None, masks: th.Tensor | None = None
     ) -> tuple[th.Tensor, th.Tensor]:
         """
         :param features: (B, features_dim)
         :param noise: noise of the discrete policy's chain, drawn if None
         :param masks: (B, K) False for discrete actions that may not be taken, None if all may
-        :return: latents (B, latent_dim) and the discrete actions (B,) that they decode to: codewords, with the gradient of
-            what was drawn (straight-through, van den Oord et al., 2017), so that critics see one latent for one action
+        :return: latents (B, latent_dim) as the discrete policy draws them, and the discrete actions (B,) that they decode to
         """
-        drawn = self.discrete_policy.sample(features, noise=noise)
-        k = self.codebook.quantize(drawn, masks)
-        return self.codebook.representative_latents(k) + (drawn - drawn.detach()), k
+        latents = self.discrete_policy.sample(features, noise=noise)
+        return latents, self.codebook.quantize(latents, masks)
+
+    def sample_latents(
+        self, features: th.Tensor, noise: th.Tensor | None = None, masks: th.Tensor | None = None
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """
+        See :meth:`draw_latents`.
+
+        :return: latents (B, latent_dim) that critics see, codewords, so that they see one latent for one action, and the
+            discrete actions (B,)
+        """
+        _, k = self.draw_latents(features, noise, masks)
+        return self.codebook.representative_latents(k), k
 
     def condition(self, features: th.Tensor, codewords: th.Tensor) -> th.Tensor:
         """

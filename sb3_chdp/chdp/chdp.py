@@ -52,8 +52,8 @@ class CHDP(ExploringAlgorithm):
         4. the values of next states depend on what the episode has returned so far, see :class:`ReturnNetwork`;
         5. of several actions the one that critics value most acts, and is the next action in targets; while training, those
            that they disagree about are tried, see :class:`Selection`;
-        6. the discrete policy is improved with the parameters that the continuous policy draws for its latents, not with the
-           stored ones, and the continuous policy for uniformly random discrete actions too;
+        6. the discrete policy is improved by comparing a few discrete actions, each with the parameters that the continuous
+           policy draws for it, see :func:`discrete_policy_loss`, and the continuous policy for uniformly random ones too;
         7. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate`,
            :func:`informative_steps` and :func:`vary_parts`;
         8. a network learns rewards, and what follows a reward counts less in the choice of actions where
@@ -252,8 +252,7 @@ class CHDP(ExploringAlgorithm):
                 alpha = self.eta / scores.abs().mean().clamp(min=1e-6)
 
                 # Step 1: discrete policy, eq. 7
-                parameters = self._parameters_of_latents(replay_data)
-                diffusion_loss, q_loss = discrete_policy_loss(policy, replay_data, features, parameters)
+                diffusion_loss, q_loss = self._discrete_policy_loss(replay_data, features)
                 loss = diffusion_loss + alpha * q_loss
                 gradient_step(loss, [policy.discrete_optimizer], self.max_grad_norm, "discrete_loss")
                 losses |= {"discrete_loss": loss, "diffusion_loss_discrete": diffusion_loss}
@@ -298,9 +297,9 @@ class CHDP(ExploringAlgorithm):
         """:return: (B, latent_dim) latents of the stored actions: their present codewords"""
         return self.actor.codebook.representative_latents(replay_data.discrete_actions)
 
-    def _parameters_of_latents(self, replay_data: HybridReplaySamples) -> th.Tensor | None:
-        """:return: (B, Pmax) parameters with which the discrete policy's latents are valued, None: the continuous policy's"""
-        return None
+    def _discrete_policy_loss(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """:return: diffusion loss and policy improvement loss of the discrete policy"""
+        return discrete_policy_loss(self.policy, replay_data, features)
 
     def _actions_to_improve(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """

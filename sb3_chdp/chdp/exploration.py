@@ -12,7 +12,7 @@ HALF_LIFE, HALF_LIFE_PER_ACTION = 500, 5
 # Before so many episodes have ended nobody knows whether success is rare
 MIN_EPISODES = 10
 # Explored actions of an episode that always remain, and smallest and largest share of all actions that they may be
-ACTIONS_PER_EPISODE, MIN_FINAL_RATE, MAX_FINAL_RATE = 1.0, 0.002, 0.1
+ACTIONS_PER_EPISODE, MIN_FINAL_RATE, MAX_FINAL_RATE = 1.0, 0.002, 0.5
 # Returns that differ by a smaller part of their size are equal but for rounding
 ROUNDING = 1e-6
 # Smallest and largest standard deviation of the noise on scaled parameters

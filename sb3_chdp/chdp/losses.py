@@ -6,6 +6,9 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.samples import HybridReplaySamples
 
+# Discrete actions beside the drawn and the stored one by whose values the discrete policy is improved
+N_COMPARED = 2
+
 
 @th.no_grad()
 def next_values(
@@ -99,25 +102,62 @@ def return_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, features: 
     return (replay_data.weights * (summands - errors).square()).mean()
 
 
+def first_occurrences(k: th.Tensor) -> th.Tensor:
+    """
+    :param k: (B, n) discrete actions, (B, n, L) of a factored space
+    :return: (B, n) False for those that stand further left already
+    """
+    k = k.flatten(1).unflatten(1, (k.shape[1], -1))
+    same = (k[:, :, None] == k[:, None]).all(dim=3)
+    return ~same.tril(-1).any(dim=2)
+
+
+def soft_quantization(latents: th.Tensor, codewords: th.Tensor, competes: th.Tensor) -> th.Tensor:
+    """
+    Weights softmax(-||e - e_j||^2 / tau) of codewords, tau the mean of these distances (as in Agustsson et al., 2017).
+
+    :param latents: (B, latent_dim) latents e, to which the weights have a gradient
+    :param codewords: (B, n, latent_dim) codewords e_j
+    :param competes: (B, n) False for codewords of weight 0
+    :return: (B, n) weights, their sum is 1
+    """
+    distances = (latents[:, None] - codewords).square().sum(dim=2)
+    tau = distances.detach().mean(dim=1, keepdim=True).clamp(min=1e-6)
+    return (-distances / tau).masked_fill(~competes, -th.inf).softmax(dim=1)
+
+
 def discrete_policy_loss(
-    policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, parameters: th.Tensor | None = None
+    policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor
 ) -> tuple[th.Tensor, th.Tensor]:
     """
-    Eq. 7, L_d - alpha Q1(s, e, a): Q of latents e drawn through the whole chain.
+    Eq. 7, L_d - alpha Q1(s, e, a), with Q1 of a soft quantisation of the latents e drawn through the whole chain.
+
+    How Q1 changes around one codeword does not tell where a better one is. So the nearest codeword competes with that of the
+    stored action and ``N_COMPARED`` others, each valued with parameters that the continuous policy draws for it, and Q1 is
+    their mean with the weights of :func:`soft_quantization`: latents move towards what is worth more.
 
     :param policy: the networks
     :param replay_data: a batch
     :param features: (B, features_dim) features of the observations, without gradient
-    :param parameters: (B, Pmax) parameters a of the drawn latents; None: those that the continuous policy draws for them
     :return: diffusion loss L_d and policy improvement loss -Q1
     """
-    actor = policy.actor
-    latents, k = actor.sample_latents(features, masks=replay_data.masks)
-    if parameters is None:
-        with th.no_grad():
-            parameters = actor.sample_parameters(features, k)
+    actor, codebook = policy.actor, policy.actor.codebook
+    latents, nearest = actor.draw_latents(features, masks=replay_data.masks)
+    with th.no_grad():
+        others = codebook.alternatives(nearest, N_COMPARED, repeatable=False)
+        k = th.cat([nearest[:, None], replay_data.discrete_actions[:, None], others], dim=1)
+        n = k.shape[1]
+        codewords = codebook.representative_latents(k)
+        repeated = features.repeat_interleave(n, dim=0)
+        parameters = actor.sample_parameters(repeated, k.flatten(0, 1))
+        values = policy.critic.score1(repeated, codewords.flatten(0, 1), parameters).view(-1, n)
+        # An action that is there twice competes once
+        competes = first_occurrences(k)
+        if replay_data.masks is not None:
+            competes &= codebook.allowed(k, replay_data.masks)
+    weights = soft_quantization(latents, codewords, competes)
     diffusion_loss = actor.discrete_policy.diffusion_loss(replay_data.latents, features)
-    return diffusion_loss, -policy.critic.score1(features, latents, parameters).mean()
+    return diffusion_loss, -(weights * values).sum(dim=1).mean()
 
 
 def continuous_policy_loss(

@@ -54,8 +54,7 @@ class PaperActor(CooperativeActor):
     def sample_latents(
         self, features: th.Tensor, noise: th.Tensor | None = None, masks: th.Tensor | None = None
     ) -> tuple[th.Tensor, th.Tensor]:
-        drawn = self.discrete_policy.sample(features, noise=noise)
-        k = self.codebook.quantize(drawn, masks)
+        drawn, k = self.draw_latents(features, noise, masks)
         if masks is None:
             return drawn, k
         # Those of forbidden actions give way to the nearest allowed codeword
@@ -241,8 +240,11 @@ class PaperCHDP(CHDP):
     def _latents(self, replay_data: HybridReplaySamples) -> th.Tensor:
         return replay_data.latents
 
-    def _parameters_of_latents(self, replay_data: HybridReplaySamples) -> th.Tensor | None:
-        return replay_data.parameters
+    def _discrete_policy_loss(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Eq. 7 as it stands: the value of the latents that were drawn, with the stored parameters."""
+        latents, _ = self.actor.sample_latents(features, masks=replay_data.masks)
+        diffusion_loss = self.actor.discrete_policy.diffusion_loss(replay_data.latents, features)
+        return diffusion_loss, -self.critic.score1(features, latents, replay_data.parameters).mean()
 
     def _exploration_rate(self) -> float:
         return 0.0

@@ -30,8 +30,8 @@ MAX_ALTERNATIVES = 64
 N_RANDOM_CANDIDATES = 64
 # Variations towards which deterministic predictions move the best action's parameters
 N_REFINEMENT_CANDIDATES = 16
-# Actions drawn, and as many alternatives, of which the best is the next action in targets: the best of several acts, too
-N_NEXT_ACTIONS = 2
+# An action drawn, and other discrete actions, of which the best is the next action in targets: the best of several acts, too
+N_NEXT_DRAWN, N_NEXT_ALTERNATIVES = 1, 3
 
 
 class CHDPPolicy(HybridPolicy):
@@ -171,7 +171,7 @@ class CHDPPolicy(HybridPolicy):
             return {"n_changed" if spec.is_factored else "n_uniform": min(sum(spec.radices), n_most)}
 
         acting = Selection(self.n_action_candidates, n_random=N_RANDOM_CANDIDATES, **alternatives(MAX_ALTERNATIVES))
-        target = Selection(N_NEXT_ACTIONS, **alternatives(N_NEXT_ACTIONS))
+        target = Selection(N_NEXT_DRAWN, **alternatives(N_NEXT_ALTERNATIVES))
         return replace(acting, sampled=True), replace(acting, n_refined=N_REFINEMENT_CANDIDATES), target
 
     def _make_optimizer(self, network: nn.Module, lr_schedule: Schedule) -> th.optim.Optimizer:
