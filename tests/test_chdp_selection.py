@@ -98,6 +98,11 @@ def test_every_discrete_action_competes_where_there_are_few(actor):
         assert (Selection(1, N_ACTIONS)(actor, critic, random_features(actor, 50)).discrete_actions == wanted).all()
 
 
+def test_three_discrete_actions_all_compete_in_targets():
+    """An action that is missing among the next ones makes states worth too little in which it is the best."""
+    assert filled_model().policy.select_target.n_uniform == N_ACTIONS == 3
+
+
 def test_sampled_values_try_what_the_critics_disagree_about(actor):
     """Of three actions one is worth 0, one 1 or -1, the critics do not know, and one -2."""
     of_actions = th.tensor([[0.0, 0.0], [1.0, -1.0], [-2.0, -2.0]])
