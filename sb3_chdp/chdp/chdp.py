@@ -314,7 +314,8 @@ class CHDP(ExploringAlgorithm):
             masks, uniform_masks = (None, None) if masks is None else (masks[n_uniform:], masks[:n_uniform])
             latents, k = self.actor.sample_latents(features[n_uniform:], masks=masks)
             if n_uniform > 0:
-                uniform_latents, uniform_k, _ = self.actor.random_actions(n_uniform, masks=uniform_masks)
+                uniform_k = self.actor.codebook.random(n_uniform, masks=uniform_masks)
+                uniform_latents = self.actor.codebook.representative_latents(uniform_k)
                 latents, k = th.cat([uniform_latents, latents]), th.cat([uniform_k, k])
         return latents, k
 
