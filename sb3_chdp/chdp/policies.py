@@ -252,8 +252,10 @@ class CHDPPolicy(HybridPolicy):
 
         :param mode: if true, set to training mode, else set to evaluation mode
         """
-        self.actor.train(mode)
-        self.critic.train(mode)
+        # To visit all of their parts takes a while, and predictions ask for it every time
+        for network in (self.actor, self.critic):
+            if network.training != mode:
+                network.train(mode)
         self.training = mode
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
