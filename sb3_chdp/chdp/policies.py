@@ -30,8 +30,9 @@ MAX_ALTERNATIVES = 64
 N_RANDOM_CANDIDATES = 64
 # Variations towards which deterministic predictions move the best action's parameters
 N_REFINEMENT_CANDIDATES = 16
-# An action drawn, and other discrete actions, of which the best is the next action in targets: the best of several acts, too
-N_NEXT_DRAWN, N_NEXT_ALTERNATIVES = 1, 3
+# Actions of which the best is the next one in targets, as the best of several acts, too. Fewer discrete actions all compete, of
+# more only two beside those drawn: seldom taken ones would win by errors of their values
+N_NEXT_ACTIONS = 4
 
 
 class CHDPPolicy(HybridPolicy):
@@ -166,12 +167,14 @@ class CHDPPolicy(HybridPolicy):
     def _make_selections(self) -> tuple[Selection, Selection, Selection]:
         """:return: rules for acting, for deterministic predictions and for next actions"""
         spec = self.action_space.spec
+        n_values = sum(spec.radices)
 
         def alternatives(n_most: int) -> dict[str, Any]:
-            return {"n_changed" if spec.is_factored else "n_uniform": min(sum(spec.radices), n_most)}
+            return {"n_changed" if spec.is_factored else "n_uniform": min(n_values, n_most)}
 
         acting = Selection(self.n_action_candidates, n_random=N_RANDOM_CANDIDATES, **alternatives(MAX_ALTERNATIVES))
-        target = Selection(N_NEXT_DRAWN, **alternatives(N_NEXT_ALTERNATIVES))
+        n_others = n_values if n_values < N_NEXT_ACTIONS else N_NEXT_ACTIONS // 2
+        target = Selection(N_NEXT_ACTIONS - n_others, **alternatives(n_others))
         return replace(acting, sampled=True), replace(acting, n_refined=N_REFINEMENT_CANDIDATES), target
 
     def _make_optimizer(self, network: nn.Module, lr_schedule: Schedule) -> th.optim.Optimizer:
