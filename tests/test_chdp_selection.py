@@ -7,6 +7,7 @@ from gymnasium import spaces
 
 from sb3_chdp.chdp.candidates import FixedDraws, SelectedActions, Selection, refined
 from sb3_chdp.chdp.critic import HybridCritic
+from sb3_chdp.chdp.policies import N_NEXT_ACTIONS
 from tests.algorithms import calls_of, filled_model
 from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, make_layout_env
 
@@ -101,6 +102,8 @@ def test_every_discrete_action_competes_where_there_are_few(actor):
 def test_three_discrete_actions_all_compete_in_targets():
     """An action that is missing among the next ones makes states worth too little in which it is the best."""
     assert filled_model().policy.select_target.n_uniform == N_ACTIONS == 3
+    many = LayoutEnv(spaces.Tuple((spaces.Discrete(N_NEXT_ACTIONS), box(-1, 1, 1))))
+    assert filled_model(many).policy.select_target.n_uniform < N_NEXT_ACTIONS
 
 
 def test_sampled_values_try_what_the_critics_disagree_about(actor):
