@@ -171,6 +171,24 @@ def test_soft_quantization():
     assert (gradient < 0).all()
 
 
+def test_forbidden_actions_do_not_compete(monkeypatch):
+    model = filled_model()
+    data = sample(model)
+    features = model.critic.features(data.observations)
+    seen, weigh = [], losses.soft_quantization
+
+    def record(*args):
+        seen.append(args)
+        return weigh(*args)
+
+    monkeypatch.setattr(losses, "soft_quantization", record)
+    masks = th.tensor([True, True, False]).expand(len(features), -1)
+    losses.discrete_policy_loss(model.policy, data._replace(masks=masks), features)
+    ((_, codewords, competes),) = seen
+    k = model.actor.codebook.quantize(codewords.flatten(0, 1)).view(competes.shape)
+    assert (k == 2).any() and not competes[k == 2].any() and competes[:, 0].all()
+
+
 def test_equal_actions_of_a_factored_space_compete_once():
     k = th.tensor([[[0, 1], [1, 1], [0, 1]]])
     assert losses.first_occurrences(k).tolist() == [[True, True, False]]

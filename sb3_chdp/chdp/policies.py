@@ -31,7 +31,7 @@ N_RANDOM_CANDIDATES = 64
 # Variations towards which deterministic predictions move the best action's parameters
 N_REFINEMENT_CANDIDATES = 16
 # Actions of which the best is the next one in targets, as the best of several acts, too. Fewer discrete actions all compete,
-# of more only two beside those drawn: seldom taken ones would win by errors of their values
+# of more only two beside those drawn: rarely taken ones may win by errors of their values
 N_NEXT_ACTIONS = 4
 
 
