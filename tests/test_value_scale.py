@@ -33,6 +33,24 @@ def test_what_untrained_critics_put_out_is_no_value():
     assert value_scale.update(1e4 * th.randn(64, 2)) is None
 
 
+@pytest.mark.parametrize(
+    ("discount", "shares_of_ends", "expected"),
+    [(0.9, 0.0, 20.0), (0.9, 0.5, 2 / 0.55), (1.0, 0.25, 8.0), (1.0, 0.0, 200.0), (0.0, 0.0, 2.0)],
+)
+def test_values_start_at_that_of_an_average_state(discount, shares_of_ends, expected):
+    value_scale = ValueScale()
+    discounts = th.full((100, 1), discount)
+    discounts[: round(100 * shares_of_ends)] = 0
+    value_scale.start(th.tensor([[1.0], [3.0]]).repeat(50, 1), discounts)
+    assert value_scale.values(th.randn(9, 1)).flatten().tolist() == pytest.approx([expected] * 9, rel=1e-5)
+
+
+def test_rewards_that_are_no_numbers_do_not_start_values():
+    value_scale = ValueScale()
+    value_scale.start(th.tensor([[1.0], [th.inf]]), th.full((2, 1), 0.9))
+    assert value_scale.center.tolist() == [0.0, 0.0]
+
+
 def test_a_first_reward_after_none_is_bounded():
     value_scale = ValueScale()
     for _ in range(100):
@@ -105,6 +123,31 @@ def test_units_of_rewards_do_not_matter(unit, policy_delay):
     assert q_means[1] / unit == pytest.approx(q_means[0], abs=0.01)
     assert (actions[0][:, 0] == actions[1][:, 0]).mean() > 0.9
     assert np.median(np.abs(actions[0] - actions[1])) < 0.02
+
+
+class Endless(Units):
+    """Nothing but a time limit, which is none to values, ends an episode."""
+
+    def step(self, action):
+        obs, reward, terminated, _, info = super().step(action)
+        return obs, reward, False, terminated, info
+
+
+def test_a_constant_in_all_rewards_does_not_matter():
+    """Where episodes do not end on their own: the same networks, and values that differ by the constant's."""
+    outputs, centers = [], []
+    for offset in (0.0, -50.0):
+        model = filled_model(Endless(offset=offset), n_transitions=200, gamma=0.9)
+        th.manual_seed(0)
+        np.random.seed(0)
+        model.train(30, 32)
+        data = sample_of(model)
+        with th.no_grad():
+            features = model.critic.features(data.observations)
+            outputs.append(th.cat(model.critic.q_values(features, data.latents, data.parameters), dim=1))
+        centers.append(model.policy.value_scale.center[0].item())
+    th.testing.assert_close(outputs[1], outputs[0], rtol=0, atol=0.05)
+    assert centers[1] - centers[0] == pytest.approx(-50 / (1 - 0.9), abs=0.5)
 
 
 def sample_of(model):

@@ -29,6 +29,8 @@ from sb3_chdp.common.utils import TargetUpdate, gradient_step
 
 # High at first, and 0 in the end: what is learnt settles
 LEARNING_RATE = LinearSchedule(1e-3, 0.0, 1.0)
+# Transitions that say what values are at first
+N_FIRST_SAMPLES = 1000
 
 
 class CHDP(ExploringAlgorithm):
@@ -220,6 +222,9 @@ class CHDP(ExploringAlgorithm):
         critic_optimizers = [policy.critic.optimizer]
         if self.critics_train_codebook:
             critic_optimizers.append(policy.codebook_optimizer)
+        if self._n_updates == 0 and policy.value_scale.adapts:
+            first = self._sample_batch(N_FIRST_SAMPLES)
+            policy.value_scale.start(first.rewards, (1 - first.dones) * first.discounts)
 
         logs: dict[str, list[th.Tensor]] = {}
         for _ in range(gradient_steps):

@@ -12,7 +12,7 @@ class ValueScale(nn.Module):
     """
     What networks of values and rewards put out stands for ``center + scale * output``: the mean of their targets so far, and
     the standard deviation of the values. When these change, the networks' last layers do as well, so that values stay (PopArt,
-    van Hasselt et al., 2016). At first all values are 0, whatever the critics put out.
+    van Hasselt et al., 2016). At first all values are the same, see :meth:`start`, whatever the critics put out.
 
     :param adapts: False: values are what the critics put out, for ever
     """
@@ -47,6 +47,22 @@ class ValueScale(nn.Module):
             (B / ``MIN_UPDATE_WEIGHT``)^(1/2) from 0
         """
         return ((targets.double() - self.center) / self.scale).float()
+
+    @th.no_grad()
+    def start(self, rewards: th.Tensor, discounts: th.Tensor) -> None:
+        """
+        Let all values be V = mean(r) + mean(discount) V, that of a state in which everything is average for ever.
+
+        From 0, bootstrapping takes some 1 / (1 - gamma) sweeps to get there. Till then actions differ by little beside how
+        much all values rise or fall.
+
+        :param rewards: (n, 1) rewards
+        :param discounts: (n, 1) discounts of the values of the next states, 0 where episodes end
+        """
+        lost = (1 - discounts.double().mean()).clamp(min=1 / len(rewards))
+        value = rewards.double().mean() / lost
+        if self.adapts and th.isfinite(value):
+            self.center[0] = value
 
     @th.no_grad()
     def update(self, targets: th.Tensor) -> tuple[th.Tensor, th.Tensor] | None:
