@@ -112,14 +112,8 @@ class WithoutCodebook(CHDP):
 class WithoutSequentialUpdate(CHDP):
     """The continuous policy is improved for the stored actions, whatever the discrete policy does."""
 
-    def _actions_to_improve(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        latents, k = replay_data.latents, replay_data.discrete_actions
-        n_uniform = round(self.uniform_fraction * len(k))
-        if n_uniform > 0:
-            with th.no_grad():
-                uniform_latents, uniform_k, _ = self.actor.random_actions(n_uniform)
-            latents, k = th.cat([uniform_latents, latents[n_uniform:]]), th.cat([uniform_k, k[n_uniform:]])
-        return latents, k
+    def _drawn_actions(self, replay_data: HybridReplaySamples, features: th.Tensor, first: int) -> tuple[th.Tensor, th.Tensor]:
+        return replay_data.latents[first:], replay_data.discrete_actions[first:]
 
 
 class WithoutBoth(WithoutCodebook, WithoutSequentialUpdate):

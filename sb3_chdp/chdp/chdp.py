@@ -21,6 +21,7 @@ from sb3_chdp.chdp.losses import (
     target_values,
 )
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_chdp.chdp.value_scale import N_FIRST_SAMPLES
 from sb3_chdp.common.arguments import Accepted, number, of_networks, warn_of_cost, whole
 from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.hybrid_box import HybridBox
@@ -29,8 +30,6 @@ from sb3_chdp.common.utils import TargetUpdate, gradient_step
 
 # High at first, and 0 in the end: what is learnt settles
 LEARNING_RATE = LinearSchedule(1e-3, 0.0, 1.0)
-# Transitions that say what values are at first
-N_FIRST_SAMPLES = 1000
 
 
 class CHDP(ExploringAlgorithm):
@@ -306,23 +305,25 @@ class CHDP(ExploringAlgorithm):
         """:return: diffusion loss and policy improvement loss of the discrete policy"""
         return discrete_policy_loss(self.policy, replay_data, features)
 
+    @th.no_grad()
     def _actions_to_improve(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         :param replay_data: a batch
         :param features: (B, features_dim) features of the observations, without gradient
-        :return: latents (B, latent_dim) and discrete actions (B,) whose parameters are improved: those of the discrete policy,
-            and uniformly random ones for a share of ``uniform_fraction`` of the batch
+        :return: latents (B, latent_dim) and discrete actions (B,) whose parameters are improved, a share of
+            ``uniform_fraction`` random ones, and those of the discrete policy
         """
-        n_uniform = round(self.uniform_fraction * len(features))
-        with th.no_grad():
-            masks = replay_data.masks
-            masks, uniform_masks = (None, None) if masks is None else (masks[n_uniform:], masks[:n_uniform])
-            latents, k = self.actor.sample_latents(features[n_uniform:], masks=masks)
-            if n_uniform > 0:
-                uniform_k = self.actor.codebook.random(n_uniform, masks=uniform_masks)
-                uniform_latents = self.actor.codebook.representative_latents(uniform_k)
-                latents, k = th.cat([uniform_latents, latents]), th.cat([uniform_k, k])
+        n_uniform, codebook, masks = round(self.uniform_fraction * len(features)), self.actor.codebook, replay_data.masks
+        latents, k = self._drawn_actions(replay_data, features, n_uniform)
+        if n_uniform > 0:
+            uniform_k = codebook.random(n_uniform, masks=None if masks is None else masks[:n_uniform])
+            latents, k = th.cat([codebook.representative_latents(uniform_k), latents]), th.cat([uniform_k, k])
         return latents, k
+
+    def _drawn_actions(self, replay_data: HybridReplaySamples, features: th.Tensor, first: int) -> tuple[th.Tensor, th.Tensor]:
+        """:return: latents and discrete actions of the discrete policy, for all of a batch but the ``first`` ones"""
+        masks = None if replay_data.masks is None else replay_data.masks[first:]
+        return self.actor.sample_latents(features[first:], masks=masks)
 
     def _update_learning_rates(self) -> None:
         """Set the learning rates of all optimizers according to their schedules."""

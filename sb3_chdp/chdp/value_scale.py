@@ -6,6 +6,8 @@ from torch import nn
 # Weight of a batch in the statistics; more at first, when they are plain averages
 MIN_UPDATE_WEIGHT = 0.005
 MIN_SCALE = 1e-8
+# Transitions that say what values are at first
+N_FIRST_SAMPLES = 1000
 
 
 class ValueScale(nn.Module):
