@@ -46,10 +46,10 @@ class OnceOnly(gym.Env):
 
 
 def advantage_of_going_back(algorithm_class, seed):
-    """:return: how much more than to finish it is said to be worth, after 300 gradient steps on random actions"""
+    """:return: how much more than to finish it is said to be worth, after 600 gradient steps on random actions"""
     env = gym.wrappers.TimeLimit(OnceOnly(), 4)
     model = filled_model(env, algorithm_class, 300, gamma=0.95, tau=0.05, seed=seed)
-    model.train(300, 64)
+    model.train(600, 64)
     critic, actor = model.critic_target, model.actor_target
     with th.no_grad():
         features = critic.features(th.ones(2, 1))
