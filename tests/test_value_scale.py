@@ -34,13 +34,13 @@ def test_what_untrained_critics_put_out_is_no_value():
 
 
 @pytest.mark.parametrize(
-    ("discount", "shares_of_ends", "expected"),
+    ("discount", "share_of_ends", "expected"),
     [(0.9, 0.0, 20.0), (0.9, 0.5, 2 / 0.55), (1.0, 0.25, 8.0), (1.0, 0.0, 200.0), (0.0, 0.0, 2.0)],
 )
-def test_values_start_at_that_of_an_average_state(discount, shares_of_ends, expected):
+def test_values_start_at_that_of_an_average_state(discount, share_of_ends, expected):
     value_scale = ValueScale()
     discounts = th.full((100, 1), discount)
-    discounts[: round(100 * shares_of_ends)] = 0
+    discounts[: round(100 * share_of_ends)] = 0
     value_scale.start(th.tensor([[1.0], [3.0]]).repeat(50, 1), discounts)
     assert value_scale.values(th.randn(9, 1)).flatten().tolist() == pytest.approx([expected] * 9, rel=1e-5)
 
@@ -126,7 +126,7 @@ def test_units_of_rewards_do_not_matter(unit, policy_delay):
 
 
 class Endless(Units):
-    """Nothing but a time limit, which is none to values, ends an episode."""
+    """Episodes end by a time limit alone, beyond which values look."""
 
     def step(self, action):
         obs, reward, terminated, _, info = super().step(action)

@@ -63,7 +63,7 @@ class ValueScale(nn.Module):
         """
         lost = (1 - discounts.double().mean()).clamp(min=1 / len(rewards))
         value = rewards.double().mean() / lost
-        if self.adapts and th.isfinite(value):
+        if th.isfinite(value):
             self.center[0] = value
 
     @th.no_grad()
