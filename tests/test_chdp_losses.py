@@ -8,6 +8,7 @@ from torch.nn import functional as F
 
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import PaperCHDP, losses
+from sb3_chdp.chdp.paper import PaperPolicy
 from sb3_chdp.common.utils import gradient_step
 from tests.algorithms import calls_of, filled_model, sample
 
@@ -214,9 +215,20 @@ def test_the_discrete_policy_learns_which_action_is_best():
     assert (k == 1).float().mean() > 0.9
 
 
+def next_q_values(policy, features):
+    """min Q' of the next action that the online critics select, of CHDP beside a share of that of a random one."""
+    actor, critic = policy.actor_target, policy.critic_target
+    latents, _, parameters = policy.select_target(actor, policy.critic, features)
+    values = th.min(*critic.q_values(features, latents, parameters))
+    if isinstance(policy, PaperPolicy):
+        return values
+    latents, _, parameters = actor.random_actions(len(features))
+    return 0.9 * values + 0.1 * th.min(*critic.q_values(features, latents, parameters))
+
+
 @BOTH
 def test_target_values(algorithm_class):
-    """r + gamma (1 - d) min Q' of the next action that the online critics select, and r; n-step discounts replace gamma."""
+    """r + gamma (1 - d) times the value of what follows, and r; n-step discounts replace gamma."""
     model = filled_model(algorithm_class=algorithm_class, gamma=0.9)
     policy, critic = model.policy, model.critic_target
     data = sample(model)._replace(dones=(th.arange(32)[:, None] % 2).float())
@@ -225,8 +237,7 @@ def test_target_values(algorithm_class):
     def expected(discounts):
         th.manual_seed(0)
         with th.no_grad():
-            latents, _, parameters = policy.select_target(policy.actor_target, model.critic, features)
-            next_values = policy.value_scale.values(th.min(*critic.q_values(features, latents, parameters)))
+            next_values = policy.value_scale.values(next_q_values(policy, features))
         return th.cat([data.rewards + discounts * (1 - data.dones) * next_values, data.rewards], dim=1)
 
     for discounts in (0.9, th.full((32, 1), 0.1)):
@@ -247,10 +258,23 @@ def test_next_values_are_whole_without_foresight():
     th.manual_seed(0)
     targets = losses.target_values(policy, data._replace(discounts=0.9, dones=0.0))
     th.manual_seed(0)
-    latents, _, parameters = policy.select_target(policy.actor_target, model.critic, features)
+    q_values = next_q_values(policy, features)
     policy.set_foresight(1.0)
-    q_values = th.min(*model.critic_target.q_values(features, latents, parameters))
+    th.manual_seed(0)
+    assert not th.equal(next_q_values(policy, features), q_values)
     th.testing.assert_close(targets[:, :1], data.rewards + 0.9 * policy.value_scale.values(q_values))
+
+
+def test_next_actions_obey_masks():
+    """The random ones as well as the best."""
+    model = filled_model()
+    data, policy = sample(model), model.policy
+    calls = calls_of(policy.critic_target.q_networks[0])
+    masks = th.zeros(32, policy.actor.codebook.n_discrete_actions, dtype=th.bool)
+    masks[:, 1] = True
+    losses.next_values(policy, data.next_observations, masks)
+    allowed = policy.actor_target.codebook.representative_latents(th.tensor([1]))
+    assert len(calls) == 2 and all((latents == allowed).all() for _, latents, _ in calls)
 
 
 @BOTH

@@ -119,11 +119,12 @@ def test_next_values_know_returns_and_actions_do_not():
     data = sample(model)
     targets, losses_of = (calls_of(critic.return_network) for critic in (model.critic_target, model.critic))
     losses.target_values(model.policy, data)
-    assert len(targets) == 1 and th.equal(targets[0][3], data.next_returns)
+    # Of the best action and of a random one
+    assert len(targets) == 2 and all(th.equal(inputs[3], data.next_returns) for inputs in targets)
     model.train(1, 32)
-    assert len(targets) == 2 and len(losses_of) == 1
+    assert len(targets) == 4 and len(losses_of) == 1
     model.predict(data.observations.numpy())
-    assert len(targets) == 2 and len(losses_of) == 1
+    assert len(targets) == 4 and len(losses_of) == 1
 
 
 def test_what_returns_add():

@@ -99,16 +99,19 @@ class CooperativeActor(nn.Module):
         condition = self.condition(features, self.codebook(k))
         return self.continuous_policy.sample(condition, self.mask(k), noise)
 
-    def random_actions(self, *shape: int, generator: th.Generator | None = None) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+    def random_actions(
+        self, *shape: int, generator: th.Generator | None = None, masks: th.Tensor | None = None
+    ) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """
         Uniformly random actions.
 
-        :param shape: how many actions
+        :param shape: how many actions; its first number is B if there are masks
         :param generator: random generator on the CPU, the global one of the model's device if None
+        :param masks: (B, K) False for discrete actions that may not be drawn, None if all may
         :return: codewords as latents (*shape, latent_dim), discrete actions (*shape), parameters (*shape, Pmax), padding 0
         """
         device = self.device if generator is None else "cpu"
-        k = self.codebook.random(*shape, generator=generator)
+        k = self.codebook.random(*shape, generator=generator, masks=masks)
         parameters = 2 * th.rand(*shape, self.continuous_policy.dim, generator=generator, device=device).to(self.device) - 1
         mask = self.mask(k)
         return self.codebook.representative_latents(k), k, parameters if mask is None else parameters * mask

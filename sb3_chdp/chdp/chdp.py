@@ -51,8 +51,8 @@ class CHDP(ExploringAlgorithm):
         3. the critics' loss trains the codebook too, so that actions of similar effect get similar codewords; these are what
            critics see of a discrete action, not the latents around them that decode to it, see :class:`CooperativeActor`;
         4. the values of next states depend on what the episode has returned so far, see :class:`ReturnNetwork`;
-        5. of several actions the one that critics value most acts, and is the next action in targets; while training, those
-           that they disagree about are tried, see :class:`Selection`;
+        5. of several actions the one that critics value most acts; while training, those that they disagree about are tried,
+           see :class:`Selection`; in targets it is the next action, with a small share of a random one, :func:`next_values`;
         6. the discrete policy is improved by comparing a few discrete actions, each with the parameters that the continuous
            policy draws for it, see :func:`discrete_policy_loss`, and the continuous policy for uniformly random ones too;
         7. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate`,

@@ -15,7 +15,8 @@ def next_values(
     policy: CHDPPolicy, observations: PyTorchObs, masks: th.Tensor | None = None, returns: th.Tensor | None = None
 ) -> th.Tensor:
     """
-    min_j Q'_j(s', e', a') of the best action (e', a') among a few of the target policies.
+    min_j Q'_j(s', e', a') of the best action (e', a') among a few of the target policies, and with the weight
+    ``policy.random_share`` of a uniformly random action.
 
     The online critics choose and the targets value, so that an error has to be in both to raise the value (double Q-learning,
     van Hasselt et al., 2016); where features are learnt, the targets choose too.
@@ -26,12 +27,20 @@ def next_values(
     :param returns: (B, 1) what episodes have returned, which the policies do not know; None: not known at all
     :return: (B, 1) values in the units of the rewards, with all that follows
     """
-    features = policy.critic_target.features(observations)
-    latents, _, parameters = policy.select_target(policy.actor_target, policy.choosing_critic, features, masks=masks)
-    critic = policy.critic_target
-    values = th.min(*critic.q_values(features, latents, parameters))
-    if returns is not None and critic.return_network is not None:
-        values = values + critic.return_network(features, latents, parameters, returns)
+    critic, actor = policy.critic_target, policy.actor_target
+    features = critic.features(observations)
+
+    def values_of(latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+        values = th.min(*critic.q_values(features, latents, parameters))
+        if returns is None or critic.return_network is None:
+            return values
+        return values + critic.return_network(features, latents, parameters, returns)
+
+    latents, _, parameters = policy.select_target(actor, policy.choosing_critic, features, masks=masks)
+    values = values_of(latents, parameters)
+    if policy.random_share > 0:
+        latents, _, parameters = actor.random_actions(len(features), masks=masks)
+        values = values.lerp(values_of(latents, parameters), policy.random_share)
     return policy.value_scale.values(values)
 
 
