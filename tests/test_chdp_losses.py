@@ -232,6 +232,7 @@ def test_target_values(algorithm_class):
     model = filled_model(algorithm_class=algorithm_class, gamma=0.9)
     policy, critic = model.policy, model.critic_target
     data = sample(model)._replace(dones=(th.arange(32)[:, None] % 2).float())
+    policy.in_units_of_critics(th.randn(32, 2))  # until then all values are the same
     features = critic.features(data.next_observations)
 
     def expected(discounts):

@@ -62,8 +62,8 @@ class CHDPPolicy(HybridPolicy):
     actor_class: ClassVar[type[CooperativeActor]] = CooperativeActor
     # Whether the units of the critics follow the rewards, see ValueScale
     adapts_values: ClassVar[bool] = True
-    # Weight of a random action in the values of next states. Values jump at the brink of a failure that the best action just
-    # avoids, and critics overshoot there: it would attract. To be where other actions fail has to cost something
+    # Weight of a random action in the values of next states. Where only the best action avoids a failure, values jump, and
+    # critics, which are smooth, overshoot: policies would go there
     random_share: ClassVar[float] = 0.1
     # What critics and continuous policy read of the features, see AttentionReads
     n_reads: ClassVar[int] = 8
