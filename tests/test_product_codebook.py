@@ -42,11 +42,32 @@ def test_nearest_codewords_block_by_block(masked):
         assert (k[:, choice] == distances.argmin(dim=1)).all()
 
 
+def test_choices_in_any_order():
+    """Of one long choice between short ones each has no more codewords than values, and decodes to its own."""
+    th.manual_seed(0)
+    radices = (2, 3, 50, 2, 3, 2)
+    codebook = ProductCodebook(radices, 4)
+    assert sum(table.numel() for table in codebook.parameters()) == sum(
+        radix * width for radix, width in zip(radices, block_widths(radices, 4), strict=True)
+    )
+    k = random_values(radices, (300,))
+    latents = codebook.representative_latents(k)
+    assert th.equal(codebook.quantize(latents), k)
+    # A value that may not be taken changes its own choice alone
+    choice, offsets = 4, th.tensor((0, *radices[:-1])).cumsum(dim=0)
+    masks = th.ones(300, sum(radices), dtype=th.bool).scatter(1, (offsets + k)[:, [choice]], False)
+    other = codebook.quantize(latents, masks)
+    assert ((other != k) == (th.arange(len(radices)) == choice)).all()
+    # Only the columns of that choice differ
+    differs = codebook(other) != codebook(k)
+    assert th.equal(differs, (codebook.choice_of_column == choice).expand_as(differs))
+
+
 def test_a_single_choice_is_the_codebook():
     th.manual_seed(0)
     codebook, product = Codebook(9, 4), ProductCodebook((9,), 4)
     with th.no_grad():
-        product.vectors[0] = codebook.codewords
+        product.tables[0][0] = codebook.codewords
     latents, k = th.rand(50, 4) * 2 - 1, th.randint(9, (50,))
     assert (product.quantize(latents)[:, 0] == codebook.quantize(latents)).all()
     assert (product(k[:, None]) == codebook(k)).all()

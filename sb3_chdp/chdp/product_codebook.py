@@ -21,7 +21,8 @@ class ProductCodebook(ProductTable):
         #: width d_e of a latent
         self.latent_dim = self.width
         # (M, 2) choice and value, in the order of the masks
-        self.register_buffer("values", th.nonzero(self.exists), persistent=False)
+        values = [(choice, value) for choice, radix in enumerate(self.radices) for value in range(radix)]
+        self.register_buffer("values", th.tensor(values), persistent=False)
 
     def quantize(self, latents: th.Tensor, masks: th.Tensor | None = None) -> th.Tensor:
         """
@@ -42,7 +43,7 @@ class ProductCodebook(ProductTable):
         :param masks: (B, sum of the radices) False for values that may not be drawn
         :return: (*shape, L) uniformly random discrete actions
         """
-        return random_values(self.radices, shape, masks, generator).to(self.vectors.device)
+        return random_values(self.radices, shape, masks, generator).to(self.offsets.device)
 
     def alternatives(self, k: th.Tensor, n: int, repeatable: bool) -> th.Tensor:
         """
@@ -68,7 +69,7 @@ class ProductCodebook(ProductTable):
         :param masks: (B, sum of the radices) False for values that may not be taken
         :return: (B, n) which of the discrete actions may be taken
         """
-        return masks.gather(1, (self.places[:, 0] + k).flatten(1)).view(k.shape).all(dim=2)
+        return masks.gather(1, (self.offsets + k).flatten(1)).view(k.shape).all(dim=2)
 
     def usage(self, k: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -77,12 +78,14 @@ class ProductCodebook(ProductTable):
         :param k: (B, L) discrete actions
         :return: (L,) share of the values that occur, and (L,) perplexity of their frequencies
         """
-        frequencies = (k[:, :, None] == th.arange(self.exists.shape[1], device=k.device)).float().mean(dim=0)
-        usage = (frequencies > 0).sum(dim=1) / self.exists.sum(dim=1)
-        perplexity = (-(th.special.xlogy(frequencies, frequencies)).sum(dim=1)).exp()
-        return usage, perplexity
+        choices = self.values[:, 0]
+        frequencies = th.bincount((self.offsets + k).flatten(), minlength=len(choices)) / len(k)
+        summands = th.stack([(frequencies > 0).float(), th.special.xlogy(frequencies, frequencies)])
+        sums = summands.new_zeros(2, len(self.radices)).index_add(1, choices, summands)
+        return sums[0] / choices.bincount(), (-sums[1]).exp()
 
     def project(self) -> None:
         """Move the codewords back into [-1, 1], where the latents are, after a gradient step."""
         with th.no_grad():
-            self.vectors.clamp_(-1, 1)
+            for table in self.tables:
+                table.clamp_(-1, 1)

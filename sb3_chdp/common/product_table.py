@@ -19,7 +19,8 @@ def block_widths(radices: tuple[int, ...], width: int) -> tuple[int, ...]:
 
 class ProductTable(nn.Module):
     """
-    A learnable vector for every value of L choices, initialised U(-1, 1). The vector of an action is their concatenation.
+    A learnable vector for every value of L choices, initialised U(-1, 1). The vector of an action is their concatenation, in
+    which choices with equally many values lie side by side.
 
     Source: Jégou et al. (2011), "Product Quantization for Nearest Neighbor Search". The cost grows with the sum of the
     radices, the number of actions with their product.
@@ -28,54 +29,70 @@ class ProductTable(nn.Module):
     :param width: width of a block at most, see :func:`block_widths`
     """
 
-    exists: th.Tensor
-    places: th.Tensor
-    slots: th.Tensor
-    choice_of_slot: th.Tensor
+    grouped: th.Tensor
+    ungrouped: th.Tensor
+    offsets: th.Tensor
+    grouped_places: th.Tensor
+    choice_of_column: th.Tensor
 
     def __init__(self, radices: tuple[int, ...], width: int):
         super().__init__()
         self.radices = tuple(radices)
-        widths = th.tensor(block_widths(self.radices, width))
+        widths = block_widths(self.radices, width)
         #: width of the vector of an action
-        self.width = int(widths.sum())
-        places, exists = value_table(self.radices)
-        is_slot = th.arange(int(widths.max())) < widths[:, None]
-        table = th.empty(*exists.shape, is_slot.shape[1]).uniform_(-1, 1)
-        # Blocks are filled up with zeros to the width of the widest one
-        self.vectors = nn.Parameter(table * is_slot[:, None])
-        self.register_buffer("exists", th.tensor(exists), persistent=False)
-        self.register_buffer("places", th.tensor(places), persistent=False)
-        self.register_buffer("slots", th.nonzero(is_slot.flatten()).squeeze(1), persistent=False)
-        self.register_buffer("choice_of_slot", th.nonzero(is_slot)[:, 0], persistent=False)
+        self.width = sum(widths)
+        # A table for all choices of equal radix
+        groups = [[i for i, other in enumerate(self.radices) if other == radix] for radix in dict.fromkeys(self.radices)]
+        shapes = [(len(group), self.radices[group[0]], widths[group[0]]) for group in groups]
+        self.tables = nn.ParameterList(th.empty(shape).uniform_(-1, 1) for shape in shapes)
+        grouped = [choice for group in groups for choice in group]
+        offsets = th.tensor((0, *self.radices[:-1])).cumsum(dim=0)
+        buffers = {
+            "grouped": th.tensor(grouped),
+            "ungrouped": th.tensor(grouped).argsort(),
+            # Where the values of a choice begin among all values, as in masks, and these places in the order of the groups
+            "offsets": offsets,
+            "grouped_places": th.cat([offsets[choice] + th.arange(self.radices[choice]) for choice in grouped]),
+            "choice_of_column": th.tensor([choice for choice in grouped for _ in range(widths[choice])]),
+        }
+        for name, buffer in buffers.items():
+            self.register_buffer(name, buffer, persistent=False)
 
-    def forward(self, k: th.Tensor, vectors: th.Tensor | None = None) -> th.Tensor:
+    def vectors(self) -> list[th.Tensor]:
+        """:return: for each group of choices the (choices, values, width) vectors"""
+        return list(self.tables)
+
+    def forward(self, k: th.Tensor) -> th.Tensor:
         """
         :param k: (..., L) values
-        :param vectors: a function of ``self.vectors`` that leaves 0 at 0, in their place
         :return: (..., width) their vectors, with gradient
         """
-        vectors = self.vectors if vectors is None else vectors
-        return vectors[th.arange(len(vectors), device=k.device), k].flatten(-2)[..., self.slots]
+        tables = self.vectors()
+        groups = k[..., self.grouped].split([len(table) for table in tables], dim=-1)
+        blocks = [table[th.arange(len(table), device=k.device), group] for table, group in zip(tables, groups, strict=True)]
+        return th.cat([block.flatten(-2) for block in blocks], dim=-1)
 
     @th.no_grad()
-    def nearest(self, points: th.Tensor, masks: th.Tensor | None = None, vectors: th.Tensor | None = None) -> th.Tensor:
+    def nearest(self, points: th.Tensor, masks: th.Tensor | None = None) -> th.Tensor:
         """
         :param points: (B, width)
         :param masks: (B, sum of the radices) False for values that are passed over
-        :param vectors: as for :meth:`forward`
         :return: (B, L) values whose vectors are nearest in Euclidean distance, block by block
         """
-        vectors = self.vectors if vectors is None else vectors
-        n_choices, _, block_width = vectors.shape
-        blocks = points.new_zeros(points.shape[0], n_choices * block_width)
-        blocks[:, self.slots] = points
+        tables = self.vectors()
+        blocks = points.split([table[:, 0].numel() for table in tables], dim=1)
         # |p - v|^2 without |p|^2, which is the same for all values
-        distances = vectors.square().sum(dim=2) - 2 * th.einsum(
-            "bld,lrd->blr", blocks.view(-1, n_choices, block_width), vectors
-        )
-        allowed = self.exists if masks is None else self.exists & masks[:, self.places]
-        return distances.masked_fill(~allowed, th.inf).argmin(dim=2)
+        distances = [
+            table.square().sum(dim=2) - 2 * th.einsum("bld,lrd->blr", block.unflatten(1, (len(table), -1)), table)
+            for table, block in zip(tables, blocks, strict=True)
+        ]
+        if masks is not None:
+            parts = masks[:, self.grouped_places].split([table[..., 0].numel() for table in tables], dim=1)
+            distances = [
+                part.masked_fill(~allowed.view(part.shape), th.inf)
+                for part, allowed in zip(distances, parts, strict=True)
+            ]
+        return th.cat([part.argmin(dim=2) for part in distances], dim=1)[:, self.ungrouped]
 
 
 def random_values(

@@ -212,6 +212,13 @@ class ActionRepresentation(nn.Module):
         return latents, th.stack([keep_embedding.all(dim=1), keep_z], dim=1)
 
 
+class EmbeddingTable(ProductTable):
+    """Embeddings of the values of L choices, tanh of the table."""
+
+    def vectors(self) -> list[th.Tensor]:
+        return [th.tanh(table) for table in self.tables]
+
+
 class FactoredActionRepresentation(ActionRepresentation):
     """
     :class:`ActionRepresentation` of actions that are made of L choices, each with embeddings of its own: a policy's first part
@@ -234,7 +241,7 @@ class FactoredActionRepresentation(ActionRepresentation):
         parameter_latent_dim: int,
         hidden_dim: int = 256,
     ):
-        tables = ProductTable(radices, embedding_dim)
+        tables = EmbeddingTable(radices, embedding_dim)
         super().__init__(features_dim, th.ones(1, n_parameters), tables.width, parameter_latent_dim, hidden_dim)
         # In place of the one of a single choice
         del self.table
@@ -242,14 +249,14 @@ class FactoredActionRepresentation(ActionRepresentation):
 
     def embed(self, k: th.Tensor) -> th.Tensor:
         """:return: (B, d1) embeddings of (B, L) values, one after the other"""
-        return self.tables(k, th.tanh(self.tables.vectors))
+        return self.tables(k)
 
     def nearest_action(self, embeddings: th.Tensor, masks: th.Tensor | None = None) -> th.Tensor:
         """:return: (B, L) values whose embeddings are nearest to the blocks of (B, d1) points, of those that masks allow"""
-        return self.tables.nearest(embeddings, masks, th.tanh(self.tables.vectors))
+        return self.tables.nearest(embeddings, masks)
 
     def mask_of(self, k: th.Tensor) -> th.Tensor:
         return self.parameter_mask.expand(k.shape[0], -1)
 
     def per_column(self, per_action: th.Tensor) -> th.Tensor:
-        return per_action[:, self.tables.choice_of_slot]
+        return per_action[:, self.tables.choice_of_column]
