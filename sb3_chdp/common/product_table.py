@@ -89,8 +89,7 @@ class ProductTable(nn.Module):
         if masks is not None:
             parts = masks[:, self.grouped_places].split([table[..., 0].numel() for table in tables], dim=1)
             distances = [
-                part.masked_fill(~allowed.view(part.shape), th.inf)
-                for part, allowed in zip(distances, parts, strict=True)
+                part.masked_fill(~allowed.view(part.shape), th.inf) for part, allowed in zip(distances, parts, strict=True)
             ]
         return th.cat([part.argmin(dim=2) for part in distances], dim=1)[:, self.ungrouped]
 
