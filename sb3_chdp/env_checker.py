@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_chdp.common.checks import LARGEST, check_observation_space
 from sb3_chdp.common.masks import allowed_now
 from sb3_chdp.common.space_mismatch import mismatch
+from sb3_chdp.common.space_tree import find_options, name_of
 from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.wrappers import FlattenHybridAction, with_scalars
 
@@ -73,17 +74,24 @@ def _check_is_env(env: Any) -> None:
 
 
 def _unusual_space(spec: HybridActionSpec) -> str | None:
-    if spec.n_discrete_actions > 1:
-        return None
-    return "The action space has a single discrete action: an algorithm for Box actions would do"
+    if spec.n_discrete_actions == 1:
+        return "The action space has a single discrete action: an algorithm for Box actions would do"
+    if spec.layout == "auto" and not spec.is_shared and isinstance(spec.space, spaces.Dict):
+        found = find_options(spec.space)
+        assert found is not None, "that is how it was read"
+        parts = [name_of(path) for path, _ in found[1]]
+        if all(len(path) == 1 for path, _ in found[1]):
+            return (
+                f"The discrete actions 0, 1, ... have the parameters {', '.join(parts)}, one box each: give "
+                "action_layout='per_action' if this is meant, and 'shared' if every action has all of them"
+            )
+    return None
 
 
 def _call(what: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     """Call what the user wrote; an error in it names what was called."""
     try:
         return function(*args, **kwargs)
-    except AssertionError:
-        raise
     except Exception as error:
         raise AssertionError(f"{what} failed with {type(error).__name__}: {error}") from error
 
@@ -188,8 +196,10 @@ class _Player:
     def play_extremes(self) -> None:
         """Play random discrete actions with all parameters at one of their ends."""
         parameters = inspect.signature(self.env.unwrapped.reset).parameters
-        if "seed" not in parameters and all(p.kind is not p.VAR_KEYWORD for p in parameters.values()):
-            raise AssertionError("reset() has no argument seed: write def reset(self, *, seed=None, options=None)")
+        takes_all = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+        for name in ("seed", "options"):
+            if name not in parameters and not takes_all:
+                raise AssertionError(f"reset() has no argument {name}: write def reset(self, *, seed=None, options=None)")
         self.reset(seed=0)
         rng = np.random.default_rng(0)
         for i in range(N_EXTREMES):

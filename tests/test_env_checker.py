@@ -87,6 +87,10 @@ def far_away_at_times(self):
     return np.array([0, 1.5 if self.t == 15 else 0.5], dtype=np.float32)
 
 
+def failing_assertion(self):
+    raise AssertionError("the robot is off")
+
+
 ERRORS = {
     "class": (lambda: Walk, "env is the class Walk: give an object of it, Walk()"),
     "vec_env": (lambda: DummyVecEnv([Walk]), "env is a DummyVecEnv, which holds several environments: give one of them"),
@@ -109,8 +113,13 @@ ERRORS = {
         "gymnasium.wrappers.FlattenObservation(env)",
     ),
     "tuple_observation": (lambda: observing(spaces.Tuple((PLANE, PLANE))), "observation_space is a Tuple, but"),
+    "oneof_inside": (
+        lambda: walk(action_space=spaces.Tuple((spaces.Discrete(2), spaces.OneOf((PLANE, PLANE))))),
+        "action_space[1] is a OneOf; a hybrid action is made of Discrete, MultiDiscrete, MultiBinary and Box parts, or is a",
+    ),
     "broken_masks": (lambda: walk(action_masks=lambda self: 1 / 0), "action_masks() failed with ZeroDivisionError: division"),
     "no_elements": (lambda: observing(box(-1, 1, 0)), "which has no elements: leave it out"),
+    "a_number": (lambda: observing(spaces.Box(-1, 1, ())), "a number: make it an array, of the shape (1,)"),
     "observation_from_one": (lambda: observing(spaces.Discrete(4, start=1)), "observation_space is Discrete(4, start=1), but"),
     "sequence_observation": (
         lambda: observing(spaces.Sequence(PLANE)),
@@ -120,6 +129,11 @@ ERRORS = {
         lambda: walk(reset=old_reset),
         "reset() has no argument seed: write def reset(self, *, seed=None, options=None)",
     ),
+    "reset_without_options": (
+        lambda: walk(reset=lambda self, seed=None: Walk.reset(self, seed=seed)),
+        "reset() has no argument options: write def reset(self, *, seed=None, options=None)",
+    ),
+    "reset_asserts": (lambda: walk(observation=failing_assertion), "reset() failed with AssertionError: the robot is off"),
     "reset_without_info": (
         lambda: walk(reset=reset_without_info),
         "reset() must return two values, observation and info, got a ndarray",
@@ -128,7 +142,11 @@ ERRORS = {
     "list": (lambda: observing(PLANE, [0.1, 0.2]), "observation is a list, not an array: return np.asarray("),
     "dtype": (lambda: observing(PLANE, np.zeros(2)), "observation has dtype float64, and its space float32: return np.a"),
     "shape": (lambda: observing(PLANE, np.zeros((1, 2), np.float32)), "observation has the shape (1, 2), and its space (2,)"),
-    "nan": (lambda: observing(PLANE, np.array([0, np.nan], np.float32)), "observation must be finite, got [ 0. nan]"),
+    "nan": (lambda: observing(PLANE, np.array([0, np.nan], np.float32)), "observation must be finite, and at most 1e+15 in"),
+    "too_large": (
+        lambda: observing(box(-np.inf, np.inf, 2), np.array([0, 1e20], np.float32)),
+        "observation must be finite, and at most 1e+15 in size, got [0.e+00 1.e+20]",
+    ),
     "outside": (
         lambda: walk(observation=far_away_at_times, terminated=False),
         "step() returned a wrong observation: observation is outside of its space: element [1] is 1.5, and the bounds there "
@@ -175,6 +193,10 @@ WARNINGS = {
     "single_action": (
         lambda: walk(action_space=spaces.Tuple((spaces.Discrete(1), spaces.Tuple((PLANE,))))),
         "a single discrete action: an algorithm for Box actions would do",
+    ),
+    "one_box_each": (
+        lambda: walk(action_space=spaces.Dict(lift=spaces.Discrete(2), x=PLANE, y=PLANE)),
+        "discrete actions 0, 1, ... have the parameters action_space['x'], action_space['y'], one box each: give",
     ),
     "no_end": (
         lambda: walk(terminated=False, truncated=False),

@@ -140,7 +140,8 @@ def test_a_mask_of_one_value_per_choice_decides(algorithm):
 
 def test_an_algorithm_that_needs_one_index():
     with pytest.raises(
-        ValueError, match=r"PDQNTD3 needs one index for all of the .*: use CHDP, HPPO, PATD3, HHQNTD3 or HyARTD3"
+        ValueError,
+        match=r"PDQNTD3 needs one index for all joint discrete actions.*, such as CHDP",
     ):
         make_model(PDQNTD3, LayoutEnv(bits_space(20)))
     with pytest.raises(ValueError, match="PDQNTD3 needs one index"):

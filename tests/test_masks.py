@@ -198,6 +198,12 @@ def test_masks_of_parts_and_of_joint_actions():
         read_masks(spec, np.ones((2, 7), dtype=bool), 2)
     with pytest.raises(ValueError, match=r"environment\(s\) \[1\]"):
         read_masks(spec, np.array([[1, 1, 1, 1, 1, 1], [1, 1, 0, 0, 1, 1]]), 2)
+    assert (read_masks(spec, [[1.0] * 6, [1.0, 0.0] * 3], 2) == read_masks(spec, [[1] * 6, [1, 0] * 3], 2)).all()
+    # Logits, say: -inf would count as True
+    with pytest.raises(ValueError, match="must be booleans, True for what may be taken"):
+        read_masks(spec, [0, -np.inf, 0, 0, 0, 0], 1)
+    with pytest.raises(ValueError, match=r"np.concatenate\(\) those of its parts"):
+        read_masks(spec, [([True, True], [True, True, True])], 1)
     # Where both forms have the same length, it is that of parts
     spec = HybridActionSpec(spaces.Tuple((spaces.MultiDiscrete([2, 2]), box(0, 1, 1))))
     assert read_masks(spec, np.array([1, 0, 0, 1]), 1).tolist() == [[False, True, False, False]]
@@ -214,7 +220,7 @@ def test_nearest_allowed_row():
 def test_evaluation_knows_masks_where_there_are_any():
     masked, free = make_vec_env(MaskedEnv, 1), make_vec_env(make_layout_env, 1)
     evaluate_policy(make_model(PATD3, masked), masked, 20)
-    with pytest.raises(ValueError, match="masked"):
+    with pytest.raises(ValueError, match="masked"), pytest.warns(UserWarning, match="Without action_masks predict"):
         evaluate_free_policy(make_model(PATD3, masked), masked, 20)
     assert len(evaluate_policy(make_model(PATD3, free), free, 2)) == 2
 

@@ -4,10 +4,12 @@ Action spaces of every kind, drawn at random: rows, native actions and masks fit
 Thoroughly: ``pytest tests/test_random_spaces.py --hypothesis-profile=thorough``
 """
 
+from typing import Any
+
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from sb3_chdp import HybridActionSpec
@@ -131,10 +133,35 @@ def test_masks(space, data, seed):
         assert (masks[:, k] == of_parts[:, starts + values].all(axis=1)).all()
 
 
+class RandomMasksEnv(LayoutEnv):
+    """Allows some values of every discrete choice; an action with another one is an error."""
+
+    def __init__(self, space):
+        super().__init__(space)
+        self.codec = HybridActionSpec(space, "shared")
+        self.starts = np.cumsum((0, *self.codec._digits[:-1]))
+
+    def action_masks(self):
+        rng = np.random.default_rng(self.t)
+        masks = rng.random(self.codec.n_mask_values) < 0.4
+        masks[self.starts + rng.integers(self.codec._digits)] = True
+        return masks
+
+    def step(self, action):
+        choices = self.codec.to_row(action)[: len(self.codec.radices)].astype(int)
+        allowed = read_masks(self.codec, self.action_masks(), 1)[0]
+        assert allowed[self.starts + choices if self.codec.is_factored else choices].all(), f"{action} is masked"
+        return super().step(action)
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-@settings(deadline=None, max_examples=3)
-@given(space=product_spaces().filter(lambda space: HybridActionSpec(space, "shared").n_discrete_actions <= 1024))
-def test_rows_of_every_algorithm(algorithm, space):
-    """The environment raises for an action that is not in its space."""
-    model = make_model(algorithm, LayoutEnv(space)).learn(20)
-    assert all(space.contains(action) for action in model.predict(np.zeros((5, 2), dtype=np.float32))[0])
+@settings(deadline=None, max_examples=settings().max_examples // 25)
+@given(space=product_spaces(), masked=st.booleans())
+def test_rows_of_every_algorithm(algorithm, space, masked):
+    """The environment raises for an action that is not in its space or that masks forbid."""
+    env: Any = RandomMasksEnv(space) if masked else LayoutEnv(space)
+    assume(algorithm.takes_factored or not HybridActionSpec(space, "shared").is_factored)
+    model = make_model(algorithm, env, action_layout="shared").learn(20)
+    masks = [env.action_masks()] * 5 if masked else None
+    actions, _ = model.predict(np.zeros((5, 2), dtype=np.float32), action_masks=masks)
+    assert all(space.contains(action) for action in actions)

@@ -2,6 +2,7 @@
 
 import io
 import pathlib
+import warnings
 from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
 
@@ -136,6 +137,12 @@ class HybridAlgorithm(BaseAlgorithm):
         :param action_masks: what ``action_masks()`` of the environments returned, False for what may not be taken
         :return: one native action for one observation, a list of n native actions for n observations; and ``state``
         """
+        if self.use_masking and action_masks is None:
+            warnings.warn(
+                "Without action_masks predict() takes any discrete action: give what action_masks() of the environments "
+                "returns, as sb3-contrib's evaluate_policy and MaskableEvalCallback do",
+                stacklevel=2,
+            )
         return self.policy.predict(observation, state, episode_start, deterministic, action_masks)  # type: ignore[call-arg]
 
     def _make_hybrid_space(self, action_layout: str) -> HybridBox:
@@ -153,9 +160,9 @@ class HybridAlgorithm(BaseAlgorithm):
         n_actions = space.spec.n_discrete_actions
         if self.action_layout == "factored" or n_actions > MAX_DISCRETE_ACTIONS:
             raise ValueError(
-                f"{type(self).__name__} needs one index for all of the {n_actions} joint discrete actions, at most "
-                f"{MAX_DISCRETE_ACTIONS} of action_layout='auto' or 'joint': use CHDP, HPPO, PATD3, HHQNTD3 or HyARTD3, which "
-                "take every discrete part as a choice of its own"
+                f"{type(self).__name__} needs one index for all joint discrete actions, {MAX_DISCRETE_ACTIONS} at most, no "
+                f"action_layout='factored', got {n_actions} of them: use an algorithm that takes every discrete part as a "
+                "choice of its own, such as CHDP"
             )
         return self._make_hybrid_space("joint")
 

@@ -76,6 +76,8 @@ def check_observation_space(space: spaces.Space[Any]) -> None:
         is_flat = isinstance(part, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary))
         if isinstance(part, spaces.Box) and 0 in part.shape:
             raise ValueError(f"{name} is {part}, which has no elements: leave it out")
+        if isinstance(part, spaces.Box) and part.shape == ():
+            raise ValueError(f"{name} is {part}, a number: make it an array, of the shape (1,)")
         starts_elsewhere = np.any(getattr(part, "start", 0))
         if is_flat and not starts_elsewhere and not (isinstance(part, spaces.MultiDiscrete) and len(part.shape) > 1):
             continue

@@ -4,7 +4,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from sb3_contrib.common.maskable.utils import get_action_masks
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_chdp.common.rows import value_table
@@ -23,9 +22,17 @@ def read_masks(spec: HybridActionSpec, masks: Any, n: int, first: int = 0) -> np
     :param n: number of environments
     :param first: index of the first of them, for messages
     :return: (n, sum of the radices) booleans for the choices of rows, (n, K) unless the space is factored
-    :raises ValueError: for another shape, or if nothing is allowed in an environment; the message names it
+    :raises ValueError: for another shape, for what is not booleans, or if nothing is allowed in an environment; the message
+        names it
     """
-    given = np.asarray(masks, dtype=bool)
+    try:
+        given = np.asarray(masks)
+    except ValueError as error:
+        raise ValueError("action_masks must be one array for each environment: np.concatenate() those of its parts") from error
+    if given.dtype != bool:
+        if not np.isin(given, (0, 1)).all():
+            raise ValueError(f"action_masks must be booleans, True for what may be taken, got {given}")
+        given = given.astype(bool)
     array = given.reshape(-1, given.shape[-1]) if given.size and given.ndim else given
     accepted = sorted({spec.n_mask_values, sum(spec.radices)})
     if array.ndim != 2 or len(array) != n or array.shape[1] not in accepted:
@@ -61,4 +68,4 @@ def env_masks(spec: HybridActionSpec, env: VecEnv) -> np.ndarray:
     :return: (n_envs, K) booleans, which discrete actions are allowed now
     :raises ValueError: see :func:`read_masks`
     """
-    return read_masks(spec, get_action_masks(env), env.num_envs)
+    return read_masks(spec, env.env_method("action_masks"), env.num_envs)

@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_chdp.common.checks import LARGEST
+
 
 def mismatch(space: spaces.Space[Any], value: Any, name: str) -> str | None:
     """
@@ -42,8 +44,9 @@ def _box_mismatch(space: spaces.Box, value: Any, name: str) -> str | None:
         return f"{name} has the shape {value.shape}, and its space {space.shape}: give both the same"
     if not np.can_cast(value.dtype, space.dtype):
         return f"{name} has dtype {value.dtype}, and its space {space.dtype}: return {as_dtype}, or declare the Box so"
-    if not np.isfinite(value).all():
-        return f"{name} must be finite, got {value}: look for a division by zero or an overflow"
+    if not (np.abs(value) <= LARGEST).all():
+        remedy = "look for a division by zero or an overflow"
+        return f"{name} must be finite, and at most {LARGEST:.0e} in size, got {value}: {remedy}"
     outside = (value < space.low) | (value > space.high)
     if outside.any():
         where = tuple(np.argwhere(outside)[0].tolist())

@@ -118,7 +118,7 @@ def collect_discrete(space: spaces.Space[Any]) -> list[DiscreteLeaf]:
         elif not isinstance(leaf, spaces.Box):
             raise ValueError(
                 f"{name_of(path)} is a {type(leaf).__name__}; a hybrid action is made of Discrete, MultiDiscrete, "
-                "MultiBinary and Box parts"
+                "MultiBinary and Box parts, or is a OneOf of Box parts as a whole"
             )
     if not leaves:
         raise ValueError(f"{space} has no discrete part: use an algorithm for Box actions, e.g. SAC or TD3")

@@ -99,9 +99,12 @@ class HybridActionSpec:
             raise ValueError(f"action_layout='factored' needs several discrete parts, got {space}")
         self.is_factored = can_factor and (layout == "factored" or (layout != "joint" and n_joint > FACTORED_ABOVE))
         if n_joint > MAX_DISCRETE_ACTIONS and not self.is_factored:
-            hint = "; action_layout='factored' has no limit" if can_factor else ""
+            hint = (
+                "action_layout='factored'" if can_factor else "several choices, as in a MultiDiscrete, with shared parameters"
+            )
             raise ValueError(
-                f"{n_joint} joint discrete actions are more than the {MAX_DISCRETE_ACTIONS} supported{hint}, in {space}"
+                f"{n_joint} joint discrete actions are more than the {MAX_DISCRETE_ACTIONS} supported; {hint} has no limit, "
+                f"in {space}"
             )
         self.n_discrete_actions = n_joint
         #: numbers of values of the choices that a row makes: a single one, K, unless the space is factored
