@@ -49,7 +49,7 @@ def test_a_preempted_job_goes_on_and_a_cancelled_one_is_reported(tmp_path):
         command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     folder = tmp_path / "out" / "hppo" / ENV_ID
-    wait_for(lambda: list(folder.glob("seed_0/checkpoint_*")), 600)
+    wait_for(lambda: list(folder.glob("seed_0/checkpoints/*_steps*")), 600)
     (first,) = running_jobs()
     slurm("scancel", "--signal=USR2", first)
     # The job that preempts it has ended; what is queued again waits for two minutes

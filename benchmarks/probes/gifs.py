@@ -21,33 +21,16 @@ EPISODES, MAX_PICTURES, COLOURS, MILLISECONDS = 5, 160, 32, 80
 STRIDES = {"Platform-v0": 9, "Goal-v0": 4, "HardGoal-v0": 4}
 
 
-class FilmedModel:
-    """
-    A model, whose every prediction takes the pictures since the last one.
-
-    :param model: the model
-    :param env: environment with ``render_frames``
-    """
-
-    def __init__(self, model: Any, env: Any):
-        self.model, self.env = model, env
-        self.pictures: list[Any] = []
-
-    def predict(self, obs: Any, deterministic: bool = True) -> Any:
-        self.pictures += self.env.unwrapped.render_frames()
-        return self.model.predict(obs, deterministic=deterministic)
-
-
 def record(model: Any, env_id: str, path: Path, episodes: int = EPISODES) -> None:
     """Write the GIF."""
     env = make_env(env_id, render_mode="rgb_array")
-    filmed = FilmedModel(model, env)
+    unwrapped: Any = env.unwrapped
     chosen: list[Any] = []
+    pictures: list[Any] = []
     for seed in range(episodes):
-        play(filmed, env, seed=seed)
-        filmed.pictures += env.unwrapped.render_frames()  # type: ignore[attr-defined]
-        episode = [*filmed.pictures[:: STRIDES.get(env_id, 1)], *[filmed.pictures[-1]] * 6]
-        filmed.pictures.clear()
+        pictures.clear()
+        play(model, env, seed=seed, look=lambda: pictures.extend(unwrapped.render_frames()))
+        episode = [*pictures[:: STRIDES.get(env_id, 1)], *[pictures[-1]] * 6]
         if chosen and len(chosen) + len(episode) > MAX_PICTURES:
             break
         chosen += episode

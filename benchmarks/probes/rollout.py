@@ -1,6 +1,7 @@
 """Episodes of the published models, for the scripts beside this one."""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,25 +52,33 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
 
 
 def play(
-    model: Any, env: gym.Env, seed: int | None = None, options: dict[str, Any] | None = None, deterministic: bool = True
+    model: Any,
+    env: gym.Env,
+    seed: int | None = None,
+    options: dict[str, Any] | None = None,
+    deterministic: bool = True,
+    look: Callable[[], None] = lambda: None,
 ) -> Episode:
     """
     Play one episode.
 
-    :param model: anything with ``predict``
+    :param model: the model
     :param env: environment with native actions
     :param seed: of the reset
     :param options: of the reset
     :param deterministic: whether the model acts so
+    :param look: called after the reset and every step
     :return: the episode
     """
     obs, _ = env.reset(seed=seed, options=options)
+    look()
     observations, actions, over = [], [], False
     while not over:
         action, _ = model.predict(obs, deterministic=deterministic)
         observations.append(obs)
         actions.append(action)
         obs, _, terminated, truncated, info = env.step(action)
+        look()
         over = terminated or truncated
     return Episode(observations, actions, info["is_success"])
 

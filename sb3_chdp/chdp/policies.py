@@ -1,5 +1,6 @@
 """Networks of CHDP: a discrete and a continuous diffusion policy, their codebook, the critics and all targets."""
 
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -181,8 +182,8 @@ class CHDPPolicy(HybridPolicy):
         return replace(acting, sampled=True), replace(acting, n_refined=N_REFINEMENT_CANDIDATES), target
 
     def _make_optimizer(self, network: nn.Module, lr_schedule: Schedule) -> th.optim.Optimizer:
-        parameters = list(network.parameters())
-        return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+        make: Callable[..., th.optim.Optimizer] = self.optimizer_class
+        return make(list(network.parameters()), lr=lr_schedule(1), **self.optimizer_kwargs)
 
     # Acting and next actions have the target critics' features. Where features are learnt, those of today mean something else,
     # and the online networks cannot read them

@@ -37,6 +37,7 @@ from sb3_chdp.common.checks import check_is_env, check_observation_space, check_
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.masks import env_masks
 from sb3_chdp.common.native_env import NativeActionVecEnv, uncounted_if_refused
+from sb3_chdp.common.policies import HybridPolicy
 from sb3_chdp.common.resume import last_checkpoint
 from sb3_chdp.common.safe_zip import VERSION, misfit, read_model, save_model
 from sb3_chdp.common.spaces import LAYOUTS, MAX_DISCRETE_ACTIONS
@@ -67,6 +68,7 @@ class HybridAlgorithm(BaseAlgorithm):
         "stats_window_size": whole(1),
         "seed": SEED,
     }
+    policy: HybridPolicy
     action_layout: str
     hybrid_space: HybridBox
     # Whether rows may have a column for every discrete choice, or only one for the joint index of all
@@ -143,7 +145,7 @@ class HybridAlgorithm(BaseAlgorithm):
                 "returns, as sb3-contrib's evaluate_policy and MaskableEvalCallback do",
                 stacklevel=2,
             )
-        return self.policy.predict(observation, state, episode_start, deterministic, action_masks)  # type: ignore[call-arg]
+        return self.policy.predict(observation, state, episode_start, deterministic, action_masks)
 
     def _make_hybrid_space(self, action_layout: str) -> HybridBox:
         """

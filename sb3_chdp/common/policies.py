@@ -2,6 +2,7 @@
 
 import io
 import pathlib
+from abc import abstractmethod
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,11 +25,17 @@ class HybridPolicy(BasePolicy):
     Base class of policies for hybrid action spaces.
 
     Networks work on rows ``[k | scaled parameters | latent]`` (:class:`HybridBox`); ``predict`` returns native actions.
-    Subclasses implement ``_predict(observation, deterministic, action_masks)``, which returns rows. ``predict`` takes masks as
-    environments give them; all other methods take what :func:`read_masks` makes of them, (n, K) booleans, or None.
+    ``predict`` takes masks as environments give them; all other methods take what :func:`read_masks` makes of them, (n, K)
+    booleans, or None.
     """
 
     action_space: HybridBox
+
+    @abstractmethod
+    def _predict(
+        self, observation: PyTorchObs, deterministic: bool = False, action_masks: th.Tensor | None = None
+    ) -> th.Tensor:
+        """:return: (n, columns) rows"""
 
     def predict(
         self,
@@ -82,7 +89,7 @@ class HybridPolicy(BasePolicy):
     def _rows(self, obs: PyTorchObs, deterministic: bool, action_masks: np.ndarray | None) -> np.ndarray:
         self.set_training_mode(False)
         with th.no_grad():
-            return self._predict(obs, deterministic, self.mask_tensor(action_masks)).cpu().numpy()  # type: ignore[call-arg]
+            return self._predict(obs, deterministic, self.mask_tensor(action_masks)).cpu().numpy()
 
     def _checked_observation(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
         """:return: the observation as a tensor or a dict of them, and whether it is one of several environments"""

@@ -8,6 +8,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from huggingface_hub import HfApi
 from huggingface_sb3 import EnvironmentName, ModelName
@@ -56,16 +57,16 @@ def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int) -> Evaluation:
             successes.append(float(local_vars["info"]["is_success"]))
 
     returns, _ = evaluate_policy(model, env, n_episodes, return_episode_rewards=True, callback=note, warn=False)
-    return Evaluation([float(value) for value in returns], successes if len(successes) == n_episodes else [])  # type: ignore
+    return Evaluation(np.array(returns).tolist(), successes if len(successes) == n_episodes else [])
 
 
 def record(model: BaseAlgorithm, env: VecEnv, length: int, path: Path) -> None:
     """Write a video of so many pictures; the environment is closed."""
     with tempfile.TemporaryDirectory() as folder:
         recorder = FrameVideoRecorder(env, folder, lambda step: step == 0, length)
-        obs = recorder.reset()
+        obs: Any = recorder.reset()
         while recorder.recording:
-            actions, _ = model.predict(obs, deterministic=True)  # type: ignore[arg-type]
+            actions, _ = model.predict(obs, deterministic=True)
             obs = recorder.step(actions)[0]
         recorder.close()
         shutil.move(next(Path(folder).glob("*.mp4")), path)

@@ -1,5 +1,6 @@
 """Policies of HyAR-TD3: a TD3 policy in the latent space of an action representation."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -46,11 +47,9 @@ class HyARTD3Policy(HybridTD3Policy):
             self.representation = FactoredActionRepresentation(features_dim, spec.radices, spec.max_parameters, *latent_dims)
         else:
             self.representation = ActionRepresentation(features_dim, th.tensor(spec.mask), *latent_dims)
-        self.representation_optimizer = self.optimizer_class(
-            self.representation.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]  # set before every update
-            **self.optimizer_kwargs,
-        )
+        make: Callable[..., th.optim.Optimizer] = self.optimizer_class
+        # The learning rate is set before every update
+        self.representation_optimizer = make(self.representation.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
 
     def state_features(self, obs: PyTorchObs) -> th.Tensor:
         """:return: (B, features_dim) features for the representation, without gradient"""
