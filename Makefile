@@ -23,10 +23,10 @@ train: $(STAMP)
 	$(BIN)/sb3-chdp enjoy --env Platform-v0 --folder logs --no-render --n-timesteps 1000 | grep --invert-match "^Episode "
 
 test: $(STAMP)
-	$(PYTEST) -m "not slow" tests
+	$(PYTEST) tests
 
 test-all: $(STAMP)
-	$(PYTEST) tests
+	$(PYTEST) -m "" tests
 
 notebooks: $(STAMP)
 	$(BIN)/python -m pytest -n 2 -q --nbmake notebooks

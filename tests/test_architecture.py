@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from sb3_chdp.registry import ALGORITHMS as REGISTRY
+
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "sb3_chdp"
 MODULES = {
@@ -33,8 +35,7 @@ def room_of(module):
 
 
 ROOMS = {name: {room_of(module) for module in imports_of(name)} - {room_of(name)} for name in MODULES}
-# A folder with policies is an algorithm
-ALGORITHMS = sorted(path.parent.name for path in PACKAGE.glob("*/policies.py") if path.parent.name != "common")
+ALGORITHMS = sorted({line.class_path.split(".")[1] for line in REGISTRY.values()})
 
 
 def imported_by(room):

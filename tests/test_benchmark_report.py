@@ -155,6 +155,20 @@ def test_protocol_tells_what_was_run(table):
     assert runs == files
 
 
+def test_documents_show_what_was_measured():
+    """Means and single scores in both README files are those of the published runs."""
+    scores = scores_of(read_results(RESULTS / "main"))
+    measured, overview = (
+        path.read_text().splitlines() for path in (BENCHMARKS / "README.md", BENCHMARKS.parent / "README.md")
+    )
+    for (env, row), cell in scores.groupby(["env", "row"]):
+        values = cell["score"].to_numpy()
+        own = f"| {env} | {display_name(row)} | success, % | {tables.mean_and_std(values)} | "
+        assert any(line.startswith(own + ", ".join(tables.numbers(values))) for line in measured), own
+        if row == "chdp":
+            assert any(line.startswith(f"| {env} | {values.mean():.1f} |") for line in overview)
+
+
 def test_deviations_are_found_and_marked():
     path = next((RESULTS / "main" / "hppo" / "Goal-v0").glob("*.json"))
     meta = json.loads(path.read_text())

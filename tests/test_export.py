@@ -12,12 +12,22 @@ from stable_baselines3 import PPO
 
 import sb3_chdp
 from sb3_chdp.common.export import ExportablePolicy
+from sb3_chdp.registry import ALGORITHMS as REGISTRY
 from tests.hybrid_envs import LayoutEnv, box, layouts, make_layout_env
 
 ort = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnxscript")
 
-ALGORITHMS = ["CHDP", pytest.param("PaperCHDP", marks=pytest.mark.slow), "HPPO", "PATD3", "PDQNTD3", "HHQNTD3", "HyARTD3"]
+# Of algorithms that export alike one is enough in a hurry
+ALGORITHMS = [
+    pytest.param(line.class_name, marks=pytest.mark.slow) if line.name == "chdp_paper" else line.class_name
+    for line in REGISTRY.values()
+]
+FACTORING = [
+    pytest.param(line.class_name, marks=pytest.mark.slow) if line.name.startswith("chdp") else line.class_name
+    for line in REGISTRY.values()
+    if line.load_class().takes_factored
+]
 N = 1_000
 MODEL = Path(__file__).parent.parent / "benchmarks" / "models" / "chdp" / "Platform-v0_1" / "Platform-v0.zip"
 PAGE = Path(__file__).parent.parent / "docs" / "guide" / "export.md"
@@ -129,7 +139,7 @@ def test_many_discrete_actions(tmp_path):
     check(sb3_chdp.HyARTD3("MlpPolicy", LayoutEnv(MANY), seed=0, buffer_size=10), tmp_path, n=50)
 
 
-@pytest.mark.parametrize("name", [pytest.param("CHDP", marks=pytest.mark.slow), "HPPO", "PATD3", "HHQNTD3", "HyARTD3"])
+@pytest.mark.parametrize("name", FACTORING)
 def test_factored_actions(name, tmp_path):
     check(getattr(sb3_chdp, name)("MlpPolicy", LayoutEnv(FACTORED), seed=0), tmp_path, n=50)
 

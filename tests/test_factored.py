@@ -10,8 +10,7 @@ from sb3_contrib.common.maskable.evaluation import evaluate_policy as evaluate_m
 from stable_baselines3.common.env_util import make_vec_env
 from torch.distributions import Categorical, Normal
 
-from sb3_chdp import CHDP, HHQNTD3, HPPO, PATD3, PDQNTD3, FlattenHybridAction, HyARTD3, HybridActionSpec, check_hybrid_env
-from sb3_chdp.chdp import PaperCHDP
+from sb3_chdp import HPPO, PATD3, PDQNTD3, FlattenHybridAction, HyARTD3, HybridActionSpec, check_hybrid_env
 from sb3_chdp.common import off_policy_algorithm
 from sb3_chdp.common.evaluation import evaluate_policy
 from sb3_chdp.common.hybrid_box import ConcatenatedBox
@@ -19,10 +18,10 @@ from sb3_chdp.common.masks import read_masks
 from sb3_chdp.envs.hard_move import motion_table, unit_motions
 from sb3_chdp.hppo.distributions import HybridDistribution
 from sb3_chdp.hyar_td3.representation import ActionBatch, FactoredActionRepresentation
-from tests.algorithms import has_learnt, make_model, snapshot
+from tests.algorithms import ALGORITHMS, has_learnt, make_model, snapshot
 from tests.hybrid_envs import LayoutEnv, box, gym_make
 
-CLASSES = [CHDP, PaperCHDP, HPPO, PATD3, HHQNTD3, HyARTD3]
+CLASSES = [algorithm for algorithm in ALGORITHMS if algorithm.takes_factored]
 # 2^76 * 5 * 3 * 4 joint actions
 HUGE = spaces.Dict(
     {"a": spaces.MultiDiscrete([3, 4]), "b": spaces.MultiBinary(76), "c": spaces.Discrete(5, start=-2), "x": box(-1, 3, 2)}

@@ -24,7 +24,7 @@ class Codebook(nn.Module):
         """
         :param latents: (B, d_e)
         :param masks: (B, K) False for discrete actions that may not be taken, None if all may
-        :return: (B,) index k of the nearest codeword in squared Euclidean distance, the paper's eq. 12
+        :return: (B,) index of the nearest codeword, eq. 12, k = argmin_j |e - e_j|^2
         """
         return nearest_row(latents, self.codewords, masks)
 

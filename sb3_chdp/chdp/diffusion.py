@@ -145,7 +145,7 @@ class DiffusionModel(nn.Module):
 
     def diffusion_loss(self, x_start: th.Tensor, condition: th.Tensor, mask: th.Tensor | None = None) -> th.Tensor:
         """
-        L_d of the paper's eq. 2: mean squared error of the predicted noise at uniformly random steps.
+        Eq. 2, L_d = E |eps - eps_theta(sqrt(alpha_bar_i) x_0 + sqrt(1 - alpha_bar_i) eps, i)|^2 for uniformly random steps i.
 
         :param x_start: (B, dim) clean samples
         :param condition: (B, condition_dim)
