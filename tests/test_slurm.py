@@ -41,7 +41,7 @@ def wait_for(condition, seconds):
 def test_a_preempted_job_goes_on_and_a_cancelled_one_is_reported(tmp_path):
     command = [
         sys.executable, "-m", "sb3_chdp", "benchmark", "--envs", ENV_ID, "--algos", "hppo", "--seeds", "0", "1",
-        "--steps", "40000", "--out", "out", "--eval-episodes", "2", "--checkpoint-interval", "1",
+        "--steps", "200000", "--out", "out", "--eval-episodes", "2", "--checkpoint-interval", "1",
         "-params", "n_envs:4", "n_steps:50", "n_epochs:1", "--jobs", "1", "--cluster", "slurm", "--slurm-time", "30",
     ]  # fmt: skip
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
@@ -56,6 +56,7 @@ def test_a_preempted_job_goes_on_and_a_cancelled_one_is_reported(tmp_path):
     wait_for(lambda: [job for job in running_jobs() if job != first], 600)
     (second,) = running_jobs()
     wait_for(lambda: (folder / "seed_1" / "started.json").exists(), 600)
+    # Killed half a minute later, when it is far from its end
     slurm("scancel", second)
     output, _ = process.communicate(timeout=600)
     assert process.returncode == 1, output

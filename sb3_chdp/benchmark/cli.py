@@ -2,7 +2,7 @@
 sb3-chdp benchmark: which algorithm is best on your environment?
 
     sb3-chdp benchmark --envs MyEnv-v0 --gym-packages my_package --algos chdp hppo sb3:sac --seeds 0 1 2 --steps 50000
-    sb3-chdp benchmark paper              the published table, with its seeds, trained anew
+    sb3-chdp benchmark paper              the published table, with its seeds, trained with today's code
     sb3-chdp benchmark report --out DIR   tables and figures of what is there, without training
 
 Every algorithm is trained by rl_zoo3 with the settings of its YAML file. Tables and learning curves end up in --out. The same
