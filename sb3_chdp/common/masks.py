@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_chdp.common.rows import value_table
+from sb3_chdp.common.rows import in_order, value_groups
 from sb3_chdp.common.spaces import HybridActionSpec
 
 # Where an environment may leave the mask of a state that no one can ask it for any more: the last one of an episode
@@ -40,8 +40,9 @@ def read_masks(spec: HybridActionSpec, masks: Any, n: int, first: int = 0) -> np
         raise ValueError(f"action_masks must be {lengths} booleans for each of {n} environment(s), got shape {given.shape}")
     if array.shape[1] == spec.n_mask_values:
         array = spec.join_masks(array)
-    table, exists = value_table(spec.radices)
-    stuck = (first + np.flatnonzero(~(array[:, table] & exists).any(axis=2).all(axis=1))).tolist()
+    # Of every choice
+    possible = in_order([array[:, places].any(axis=2) for _, places in value_groups(spec.radices)], spec.radices)
+    stuck = (first + np.flatnonzero(~possible.all(axis=1))).tolist()
     if stuck:
         raise ValueError(
             f"action_masks must allow at least one discrete action, and those of environment(s) {stuck} allow none"

@@ -1,9 +1,10 @@
 """Tables of vectors for actions that are made of several choices: a block of the vector for each (product quantisation)."""
 
+import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_chdp.common.rows import value_table
+from sb3_chdp.common.rows import in_order, value_groups
 
 
 def block_widths(radices: tuple[int, ...], width: int) -> tuple[int, ...]:
@@ -30,7 +31,6 @@ class ProductTable(nn.Module):
     """
 
     grouped: th.Tensor
-    ungrouped: th.Tensor
     offsets: th.Tensor
     grouped_places: th.Tensor
     choice_of_column: th.Tensor
@@ -41,22 +41,20 @@ class ProductTable(nn.Module):
         widths = block_widths(self.radices, width)
         #: width of the vector of an action
         self.width = sum(widths)
-        # A table for all choices of equal radix
-        groups = [[i for i, other in enumerate(self.radices) if other == radix] for radix in dict.fromkeys(self.radices)]
-        shapes = [(len(group), self.radices[group[0]], widths[group[0]]) for group in groups]
+        groups = value_groups(self.radices)
+        shapes = [(*places.shape, widths[choices[0]]) for choices, places in groups]
         self.tables = nn.ParameterList(th.empty(shape).uniform_(-1, 1) for shape in shapes)
-        grouped = [choice for group in groups for choice in group]
-        offsets = th.tensor((0, *self.radices[:-1])).cumsum(dim=0)
+        grouped = np.concatenate([choices for choices, _ in groups])
         buffers = {
-            "grouped": th.tensor(grouped),
-            "ungrouped": th.tensor(grouped).argsort(),
-            # Where the values of a choice begin among all values, as in masks, and these places in the order of the groups
-            "offsets": offsets,
-            "grouped_places": th.cat([offsets[choice] + th.arange(self.radices[choice]) for choice in grouped]),
-            "choice_of_column": th.tensor([choice for choice in grouped for _ in range(widths[choice])]),
+            # The choices in the order of the groups, and all values in this order
+            "grouped": grouped,
+            "grouped_places": np.concatenate([places.flatten() for _, places in groups]),
+            # Where the values of a choice begin among all values, as in masks
+            "offsets": np.cumsum((0, *self.radices[:-1])),
+            "choice_of_column": grouped.repeat(np.array(widths)[grouped]),
         }
         for name, buffer in buffers.items():
-            self.register_buffer(name, buffer, persistent=False)
+            self.register_buffer(name, th.tensor(buffer), persistent=False)
 
     def vectors(self) -> list[th.Tensor]:
         """:return: for each group of choices the (choices, values, width) vectors"""
@@ -91,7 +89,7 @@ class ProductTable(nn.Module):
             distances = [
                 part.masked_fill(~allowed.view(part.shape), th.inf) for part, allowed in zip(distances, parts, strict=True)
             ]
-        return th.cat([part.argmin(dim=2) for part in distances], dim=1)[:, self.ungrouped]
+        return in_order([part.argmin(dim=2) for part in distances], self.radices)
 
 
 def random_values(
@@ -110,9 +108,11 @@ def random_values(
         counts = th.tensor(radices)
         # Rounding may lead to the count itself
         return (draws * counts).long().minimum(counts - 1)
-    table, exists = value_table(radices)
-    allowed = masks[:, th.tensor(table, device=device)] & th.tensor(exists, device=device)
-    allowed = allowed.view(len(masks), *[1] * (len(shape) - 1), *table.shape)
-    counts = allowed.sum(dim=-1)
-    ranks = (draws * counts).long().minimum(counts - 1)
-    return (allowed.cumsum(dim=-1) > ranks[..., None]).byte().argmax(dim=-1)
+    parts = []
+    for choices, places in value_groups(radices):
+        allowed = masks[:, th.tensor(places, device=device)]
+        allowed = allowed.view(len(masks), *[1] * (len(shape) - 1), *places.shape)
+        counts = allowed.sum(dim=-1)
+        ranks = (draws[..., th.tensor(choices)] * counts).long().minimum(counts - 1)
+        parts.append((allowed.cumsum(dim=-1) > ranks[..., None]).byte().argmax(dim=-1))
+    return in_order(parts, radices)

@@ -84,19 +84,35 @@ class RowLayout:
 
 
 @lru_cache
-def value_table(radices: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def value_groups(radices: tuple[int, ...]) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     """
+    Choices that have equally many values, so that one array holds what belongs to these.
+
     :param radices: numbers of values of L choices
-    :return: (L, R) where the values of a choice are among all values one after the other, and which of these places exist;
-        R is the largest radix
+    :return: for every number r of values the (n,) choices that have so many, and (n, r) where their values are among those of
+        all choices one after the other
     """
-    values = np.arange(max(radices))
-    exists = values < np.array(radices)[:, None]
     offsets = np.cumsum((0, *radices[:-1]))
-    table = np.where(exists, offsets[:, None] + values, 0)
-    table.setflags(write=False)
-    exists.setflags(write=False)
-    return table, exists
+    groups = []
+    for radix in dict.fromkeys(radices):
+        choices = np.flatnonzero(np.array(radices) == radix)
+        groups.append((choices, offsets[choices, None] + np.arange(radix)))
+        for array in groups[-1]:
+            array.setflags(write=False)
+    return tuple(groups)
+
+
+def in_order(parts: list[Array], radices: tuple[int, ...]) -> Array:
+    """
+    :param parts: (..., n) for each of :func:`value_groups` something of its n choices
+    :param radices: numbers of values of the L choices
+    :return: (..., L) the same in the order of the choices
+    """
+    order = np.concatenate([choices for choices, _ in value_groups(radices)]).argsort()
+    first = parts[0]
+    if isinstance(first, th.Tensor):
+        return th.cat(parts, dim=-1)[..., th.tensor(order, device=first.device)]
+    return np.concatenate(parts, axis=-1)[..., order]
 
 
 def best_values(scores: Array, radices: tuple[int, ...]) -> Array:
@@ -107,11 +123,11 @@ def best_values(scores: Array, radices: tuple[int, ...]) -> Array:
     """
     if len(radices) <= 1:
         return scores.argmax(-1)
-    table, exists = value_table(radices)
-    if isinstance(scores, th.Tensor):
-        in_choices = scores[..., th.tensor(table, device=scores.device)]
-        return in_choices.masked_fill(~th.tensor(exists, device=scores.device), -th.inf).argmax(-1)
-    return np.where(exists, scores[..., table], -np.inf).argmax(-1)
+    parts = []
+    for _, places in value_groups(radices):
+        index = th.tensor(places, device=scores.device) if isinstance(scores, th.Tensor) else places
+        parts.append(scores[..., index].argmax(-1))
+    return in_order(parts, radices)
 
 
 def pack_bits(masks: Array) -> Array:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_chdp.common.arguments import check, one_of
-from sb3_chdp.common.rows import Array, RowLayout, value_table
+from sb3_chdp.common.rows import Array, RowLayout, in_order, value_groups
 from sb3_chdp.common.space_tree import (
     DiscreteLeaf,
     Path,
@@ -277,10 +277,12 @@ class HybridActionSpec:
         if masks is None:
             high = self.radices if self.is_factored else self.n_discrete_actions
             return rng.integers(high, size=(n, len(self.radices)) if self.is_factored else n)
-        table, exists = value_table(self.radices)
-        allowed = masks[:, table] & exists
-        ranks = rng.integers(allowed.sum(axis=2))
-        choices = (allowed.cumsum(axis=2) > ranks[:, :, None]).argmax(axis=2)
+        parts = []
+        for _, places in value_groups(self.radices):
+            allowed = masks[:, places]
+            ranks = rng.integers(allowed.sum(axis=2))
+            parts.append((allowed.cumsum(axis=2) > ranks[:, :, None]).argmax(axis=2))
+        choices = in_order(parts, self.radices)
         return choices if self.is_factored else choices[:, 0]
 
     def sample_rows(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:
