@@ -40,8 +40,8 @@ def read_masks(spec: HybridActionSpec, masks: Any, n: int, first: int = 0) -> np
         raise ValueError(f"action_masks must be {lengths} booleans for each of {n} environment(s), got shape {given.shape}")
     if array.shape[1] == spec.n_mask_values:
         array = spec.join_masks(array)
-    # Of every choice
-    possible = in_order([array[:, places].any(axis=2) for _, places in value_groups(spec.radices)], spec.radices)
+    # A value of every choice
+    possible = in_order([array[:, places].max(axis=2) for _, places in value_groups(spec.radices)], spec.radices)
     stuck = (first + np.flatnonzero(~possible.all(axis=1))).tolist()
     if stuck:
         raise ValueError(
