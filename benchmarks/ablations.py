@@ -163,6 +163,14 @@ class Ablation(Algorithm):
         return ALGORITHMS[self.name.split("_without_")[0]].hyperparams
 
 
+def register_ablations(classes: dict[str, type[CHDP]]) -> None:
+    """Put variants into the registry, so that command line and benchmark know them by these names."""
+    for name, variant in classes.items():
+        path = f"{variant.__module__}.{variant.__name__}"
+        ALGORITHMS[name] = Ablation(name, name.replace("_", " "), path)
+    register()
+
+
 # By name; CHDP and PaperCHDP themselves have everything
 ABLATIONS: dict[str, type[CHDP]] = {
     "chdp_without_diffusion": WithoutDiffusion,
@@ -174,6 +182,4 @@ ABLATIONS: dict[str, type[CHDP]] = {
     "chdp_paper_without_sequential_update": PaperWithoutSequentialUpdate,
     "chdp_paper_without_both": PaperWithoutBoth,
 }
-for _name, _class in ABLATIONS.items():
-    ALGORITHMS[_name] = Ablation(_name, _name.replace("_", " "), f"{__name__}.{_class.__name__}")
-register()
+register_ablations(ABLATIONS)

@@ -8,18 +8,22 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_chdp import ALGORITHMS, CHDP
 from sb3_chdp.chdp import PaperCHDP
+from sb3_chdp.chdp.candidates import Selection
 from tests.algorithms import calls_of, filled_model, has_learnt, sample, snapshot
 from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, make_layout_env
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import ablations
+import leave_one_out
 
-# Importing it puts them into the registry, which other tests read
-for name in ablations.ABLATIONS:
+VARIANTS = {**ablations.ABLATIONS, **leave_one_out.LEFT_OUT}
+# Importing them puts them into the registry, which other tests read
+for name in VARIANTS:
     ALGORITHMS.pop(name, None)
 
 PREFIXES = {"chdp_": CHDP, "chdp_paper_": PaperCHDP}
@@ -29,14 +33,30 @@ CASES = [(table, name) for table in TABLES for name in NAMES]
 
 
 def make(table, name, env=None, **kwargs):
-    algorithm = PREFIXES[table] if name == "full" else ablations.ABLATIONS[table + name]
+    algorithm = PREFIXES[table] if name == "full" else VARIANTS[table + name]
     return filled_model(env, algorithm_class=algorithm, **kwargs)
 
 
-@pytest.mark.parametrize("table, name", CASES)
+LACKS = {
+    "without_normalization": lambda model: isinstance(model.critic.features_extractor, FlattenExtractor),
+    "without_value_scale": lambda model: not model.policy.value_scale.adapts,
+    "without_reads": lambda model: model.actor.reads is None,
+    "without_random_share": lambda model: model.policy.random_share == 0,
+    "without_candidates": lambda model: model.policy.select == model.policy.select_target == Selection(1),
+    "without_foresight": lambda model: model.policy.set_foresight(0.5) is None and model.critic.foresight == 1,
+    "without_returns": lambda model: model.critic.return_network is None,
+    "without_uniform": lambda model: model.uniform_fraction == 0,
+    "without_learnt_codewords": lambda model: not model.critics_train_codebook,
+    "without_comparison": lambda model: type(model)._discrete_policy_loss is not CHDP._discrete_policy_loss,
+    "without_parts": lambda model: type(model)._exploratory_rows is not CHDP._exploratory_rows,
+}
+
+
+@pytest.mark.parametrize("table, name", [*CASES, *(("chdp_", name[5:]) for name in leave_one_out.LEFT_OUT)])
 def test_they_run(table, name, tmp_path):
     model = make(table, name, make_layout_env("nested"))
     assert isinstance(model, PaperCHDP) == (table == "chdp_paper_")
+    assert LACKS.get(name, lambda _: True)(model)
     before = snapshot(model)
     model.learning_starts = 60
     model.learn(20, reset_num_timesteps=False)
