@@ -13,7 +13,7 @@ pytest.importorskip("rliable")
 from sb3_chdp import ALGORITHMS
 from sb3_chdp.benchmark import figures, paper, tables
 from sb3_chdp.benchmark.results import FIELDS, ResultsError, differences, read_results
-from sb3_chdp.benchmark.runs import display_name
+from sb3_chdp.benchmark.runs import display_name, file_name
 from sb3_chdp.benchmark.statistics import iqm, matrix_of, probability_of_improvement, scores_of
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
@@ -150,7 +150,11 @@ def test_protocol_tells_what_was_run(table):
     pytest.importorskip("rl_zoo3")
     named = paper.load_protocol()[table]
     assert named == paper.describe_cells(RESULTS, table), "python benchmarks/publish.py writes it anew"
-    runs = {(cell.get("variant", cell["algorithm"]), cell["environment"], seed) for cell in named for seed in cell["seeds"]}
+    runs = {
+        (cell.get("variant", cell["algorithm"]), file_name(cell["environment"]), seed)
+        for cell in named
+        for seed in cell["seeds"]
+    }
     files = {(path.parts[-3], path.parts[-2], int(path.stem[5:])) for path in (RESULTS / table).glob("*/*/*.csv")}
     assert runs == files
 
