@@ -79,9 +79,8 @@ def test_damaged_checkpoints(damage, tmp_path):
         shutil.rmtree(copy)
     damage(newer / "model.zip")
     damage(older / "state.npz")
-    with (
-        pytest.warns(UserWarning, match=r"(model\.zip|state\.npz) is damaged"),
-        pytest.raises(DamagedError, match=r"state\.npz"),
+    with pytest.warns(UserWarning, match=r"(model\.zip|state\.npz) is damaged"), pytest.raises(
+        DamagedError, match=r"state\.npz"
     ):
         resume(tmp_path / "run", make_env(1))
 

@@ -114,7 +114,7 @@ sb3-chdp train {algo_option} --env {env_id} -n {n_timesteps}
 The hyperparameters were these; `-params` or a file for `-conf` sets what differs from the file of today.
 
 ```python
-{pformat({**hyperparams, "n_timesteps": n_timesteps}, sort_dicts=True)}
+{pformat({**hyperparams, 'n_timesteps': n_timesteps}, sort_dicts=True)}
 ```
 """
     return ModelCard(f"---\n{data.to_yaml()}\n---\n{text}")
