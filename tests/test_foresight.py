@@ -171,7 +171,7 @@ def test_masks_and_several_environments():
     assert ForesightSums(*model.foresight_sums).n > MIN_CLAIMS
 
 
-def test_the_paper_looks_ahead(monkeypatch):
-    monkeypatch.setattr(exploring, "MIN_UPDATES", 0)
-    paper, model = (fast_model(algorithm, learning_starts=10).learn(40) for algorithm in (PaperCHDP, CHDP))
+def test_the_paper_looks_ahead():
+    few = dict(learning_starts=10, gradient_steps=8)
+    paper, model = (fast_model(algorithm, **few).learn(60) for algorithm in (PaperCHDP, CHDP))
     assert paper.critic.foresight == 1 and paper.foresight_sums == ForesightSums() != model.foresight_sums
