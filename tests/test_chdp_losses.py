@@ -11,6 +11,7 @@ from sb3_chdp.chdp import PaperCHDP, losses
 from sb3_chdp.chdp.paper import PaperPolicy
 from sb3_chdp.common.utils import gradient_step
 from tests.algorithms import calls_of, filled_model, sample
+from tests.hybrid_envs import make_layout_env
 
 BOTH = pytest.mark.parametrize("algorithm_class", [CHDP, PaperCHDP])
 
@@ -122,25 +123,21 @@ def test_continuous_step_sees_the_updated_discrete_policy(algorithm_class):
     assert not th.equal(weights[1 + n], weights[0])
 
 
-def test_discrete_actions_are_compared_with_parameters_of_their_own(monkeypatch):
+def test_discrete_actions_are_compared_with_parameters_of_their_own():
     """The nearest, the stored and two other discrete actions, each with parameters that the continuous policy draws for it."""
-    model = filled_model()
+    model = filled_model(make_layout_env("nested"))
     data, actor = sample(model), model.actor
     features = model.critic.features(data.observations)
-    valued, drawn_for = calls_of(model.critic.q_networks[0]), []
-    draw = actor.sample_parameters
-
-    def record(features, k):
-        drawn_for.append((k, draw(features, k)))
-        return drawn_for[-1][1]
-
-    monkeypatch.setattr(actor, "sample_parameters", record)
+    valued, conditions = calls_of(model.critic.q_networks[0]), calls_of(actor.continuous_policy.noise_predictor.of_condition)
     losses.discrete_policy_loss(model.policy, data, features)
-    ((k, parameters),) = drawn_for
-    ((_, latents, seen_parameters),) = valued
-    assert th.equal(seen_parameters, parameters)
+    ((_, latents, parameters),) = valued
+    k = actor.codebook.quantize(latents)
     assert th.equal(latents, actor.codebook.representative_latents(k))
     assert th.equal(k.view(-1, 2 + losses.N_COMPARED)[:, 1], data.discrete_actions)
+    # Drawn given these codewords, and as many as the action has
+    ((condition,),) = conditions
+    assert th.equal(condition[:, features.shape[1] :][:, : latents.shape[1]], latents)
+    assert th.equal(parameters != 0, actor.mask(k).bool())
 
 
 def test_stored_parameters_value_the_latents_of_the_paper():
@@ -172,22 +169,25 @@ def test_soft_quantization():
     assert (gradient < 0).all()
 
 
-def test_forbidden_actions_do_not_compete(monkeypatch):
+def test_forbidden_actions_do_not_compete():
+    """However much a forbidden one is worth, stored or not."""
     model = filled_model()
     data = sample(model)
     features = model.critic.features(data.observations)
-    seen, weigh = [], losses.soft_quantization
-
-    def record(*args):
-        seen.append(args)
-        return weigh(*args)
-
-    monkeypatch.setattr(losses, "soft_quantization", record)
     masks = th.tensor([True, True, False]).expand(len(features), -1)
-    losses.discrete_policy_loss(model.policy, data._replace(masks=masks), features)
-    ((_, codewords, competes),) = seen
-    k = model.actor.codebook.quantize(codewords.flatten(0, 1)).view(competes.shape)
-    assert (k == 2).any() and not competes[k == 2].any() and competes[:, 0].all()
+
+    def q_losses():
+        for of_masks in (masks, None):
+            th.manual_seed(0)
+            yield losses.discrete_policy_loss(model.policy, data._replace(masks=of_masks), features)[1].item()
+
+    masked, free = q_losses()
+    codeword = model.actor.codebook.codewords[2]
+    model.critic.q_networks[0].register_forward_hook(
+        lambda _, args, values: values + 100 * (args[1] == codeword).all(dim=1, keepdim=True)
+    )
+    masked_then, free_then = q_losses()
+    assert masked_then == masked and free_then < free - 1
 
 
 def test_equal_actions_of_a_factored_space_compete_once():

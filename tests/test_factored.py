@@ -11,7 +11,6 @@ from stable_baselines3.common.env_util import make_vec_env
 from torch.distributions import Categorical, Normal
 
 from sb3_chdp import HPPO, PATD3, PDQNTD3, FlattenHybridAction, HyARTD3, HybridActionSpec, check_hybrid_env
-from sb3_chdp.common import off_policy_algorithm
 from sb3_chdp.common.evaluation import evaluate_policy
 from sb3_chdp.common.hybrid_box import ConcatenatedBox
 from sb3_chdp.common.masks import read_masks
@@ -155,10 +154,10 @@ def test_buffers_grow_with_the_sum_of_the_radices(algorithm):
     assert widths[1] - widths[0] <= 40
 
 
-def test_a_large_buffer_says_what_it_will_take(monkeypatch):
-    monkeypatch.setattr(off_policy_algorithm, "LARGE_ROWS", 10**6)
-    with pytest.warns(UserWarning, match=r"will take 0\.0 GB: 1025 numbers for each of buffer_size=500"):
-        make_model(PATD3, LayoutEnv(bits_space(10)))
+def test_a_large_buffer_says_what_it_will_take():
+    # None of it is used
+    with pytest.warns(UserWarning, match=r"will take 1\.2 GB: 1025 numbers for each of buffer_size=300000"):
+        make_model(PATD3, LayoutEnv(bits_space(10)), buffer_size=300_000)
 
 
 def test_log_prob_of_several_choices():

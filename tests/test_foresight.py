@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import CheckpointCallback, StopTrainingO
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chdp import CHDP
-from sb3_chdp.chdp import PaperCHDP, exploring
+from sb3_chdp.chdp import PaperCHDP
 from sb3_chdp.chdp.foresight import MIN_CLAIMS, Claims, ForesightSums, expected_outcomes, explore
 from tests.algorithms import fast_model, filled_model, sample
 from tests.hybrid_envs import MaskedEnv, box, make_layout_env
@@ -142,17 +142,21 @@ def test_it_is_saved(tmp_path):
     loaded.learn(30, reset_num_timesteps=False)
 
 
-def test_ends_of_episodes(monkeypatch):
+def test_ends_of_episodes():
     """Nothing follows a terminal state; what follows a time limit is not known, as the next episode has begun."""
     model = filled_model(DummyVecEnv([lambda: make_layout_env("nested")] * 3))
-    monkeypatch.setattr(exploring, "next_values", lambda policy, observation, masks, returns: th.full((3, 1), 7.0))
+    # All next states are worth the center, 2
+    for network in model.critic_target.q_networks:
+        for layer in (network.value[-1], network.advantage[-1]):
+            for parameter in layer.parameters():
+                parameter.zero_()
     model.policy.value_scale.variance += 4 - model.policy.value_scale.variance
     model.policy.value_scale.center[0] = 2.0
     claims = Claims(np.empty((3, 0)), np.arange(3), np.zeros(3), np.array([1.0, 10.0, 100.0]), np.array([0.5, 0.5, 0.5]))
     infos = [{}, {}, {"TimeLimit.truncated": True}]
     rewards = np.array([3.0, 4.0, 5.0], dtype=np.float32)
     model._check_claims(claims, claims.rows, model._last_obs, rewards, np.array([False, True, True]), infos)
-    goes_on, ends = (3 + 7 * model.gamma - 2) / 2 - 0.5, (4 - 2) / 2 - 0.5
+    goes_on, ends = (3 + 2 * model.gamma - 2) / 2 - 0.5, (4 - 2) / 2 - 0.5
     assert model.foresight_sums.fy == pytest.approx(goes_on + 10 * ends, rel=0.01)
 
 

@@ -75,32 +75,20 @@ def test_critics_leave_the_codebook_alone():
     assert all(th.equal(state, states[0]) for state in states) and not th.equal(codewords, states[0])
 
 
-def test_it_explores_in_the_warm_up_alone(model, monkeypatch):
+def test_it_explores_in_the_warm_up_alone(model):
     """Then one draw of its policies acts, and the critics are not asked."""
     columns = model.hybrid_space.columns
     assert len(np.unique(columns.discrete_actions(model.replay_buffer.actions[:60, 0]))) == 3
     model.learning_starts, model.gradient_steps = 60, 0
-    calls = calls_of(model.critic_target.q_networks[0])
-    drawn = []
-    sample_latents, sample_parameters = model.actor.sample_latents, model.actor.sample_parameters
-
-    def record_latents(*args):
-        latents, k = sample_latents(*args)
-        drawn.append({"latents": latents})
-        return latents, k
-
-    def record_parameters(*args):
-        drawn[-1]["parameters"] = sample_parameters(*args)
-        return drawn[-1]["parameters"]
-
-    monkeypatch.setattr(model.actor, "sample_latents", record_latents)
-    monkeypatch.setattr(model.actor, "sample_parameters", record_parameters)
+    asked = calls_of(model.critic_target.q_networks[0])
+    policies = (model.actor.discrete_policy, model.actor.continuous_policy)
+    chains = [calls_of(policy.noise_predictor) for policy in policies]
     model.learn(100, reset_num_timesteps=False, log_interval=10**6)
     assert model.logger.name_to_value["rollout/exploration_rate"] == 0
+    assert not asked
+    for calls in chains:
+        assert len(calls) == 100 * model.n_diffusion_steps and all(len(x) == 1 for x, _ in calls)
     acted = model.replay_buffer.actions[60:160, 0]
-    assert not calls and len(drawn) == 100
-    for name in ("latents", "parameters"):
-        np.testing.assert_array_equal(columns.view(acted, name), th.cat([draw[name] for draw in drawn]))
     latents = th.as_tensor(columns.view(acted, "latents"))
     np.testing.assert_array_equal(model.actor.codebook.quantize(latents), columns.discrete_actions(acted))
 
