@@ -154,7 +154,7 @@ def test_buffers_hold_the_masks_of_both_states(n_steps, explicit, tells_last):
     if explicit:
         kwargs = dict(replay_buffer_class=NStepReplayBuffer, replay_buffer_kwargs=dict(n_steps=n_steps, gamma=0.99))
     model = make_model(PATD3, env, buffer_size=300, **kwargs).learn(600)
-    data = model._sample_batch(2000)
+    data = sample(model, 2000)
     assert (data.masks == data.observations.bool()).all()
     ends_right = (data.next_masks == data.next_observations.bool()).all(dim=1)
     # Of ten states of an episode the last is followed by another one's first

@@ -6,7 +6,7 @@ import torch as th
 from gymnasium import spaces
 
 from sb3_chdp import PDQNTD3
-from tests.algorithms import LAYOUTS, make_model
+from tests.algorithms import LAYOUTS, make_model, sample
 from tests.hybrid_envs import make_layout_env
 
 
@@ -111,7 +111,7 @@ def test_a_shared_extractor_learns_from_the_actors_loss_alone():
     policy_kwargs = dict(net_arch=[8], share_features_extractor=True)
     model = make_model(PDQNTD3, env, "CnnPolicy", policy_kwargs=policy_kwargs).learn(20)
     weight = next(model.actor.features_extractor.parameters())
-    data = model._sample_batch(8)
+    data = sample(model, 8)
     assert th.autograd.grad(model._critic_loss(data), weight, allow_unused=True) == (None,)
     assert th.autograd.grad(model._actor_loss(data), weight)[0].any()
 

@@ -81,7 +81,7 @@ def layout_of(space, data):
     layouts = ["shared"]
     if spec.n_discrete_actions <= 4096:
         layouts.append("joint")
-    if len(spec._digits) > 1:
+    if len(spec.digits) > 1:
         layouts.append("factored")
     return data.draw(st.sampled_from(layouts))
 
@@ -113,7 +113,7 @@ def test_masks(space, data, seed):
     kind = data.draw(st.sampled_from([HybridBox, ConcatenatedBox, ScoreBox]))
     rows_space = kind(space, layout_of(space, data), state_parts=("masks", "next_masks"))
     spec, rng = rows_space.spec, np.random.default_rng(seed)
-    digits = spec._digits
+    digits = spec.digits
     starts = np.cumsum((0, *digits[:-1]))
     of_parts = rng.random((6, sum(digits))) < 0.4
     for start, radix in zip(starts, digits, strict=True):
@@ -139,12 +139,12 @@ class RandomMasksEnv(LayoutEnv):
     def __init__(self, space):
         super().__init__(space)
         self.codec = HybridActionSpec(space, "shared")
-        self.starts = np.cumsum((0, *self.codec._digits[:-1]))
+        self.starts = np.cumsum((0, *self.codec.digits[:-1]))
 
     def action_masks(self):
         rng = np.random.default_rng(self.t)
         masks = rng.random(self.codec.n_mask_values) < 0.4
-        masks[self.starts + rng.integers(self.codec._digits)] = True
+        masks[self.starts + rng.integers(self.codec.digits)] = True
         return masks
 
     def step(self, action):

@@ -89,12 +89,13 @@ class HybridActionSpec:
                 f"The action space must be a Tuple, Dict or OneOf with a discrete and a continuous part, got {space}"
             )
 
-        self._digits = tuple(radix for leaf in self._discrete_leaves for radix in leaf.radices)
+        #: numbers of values of all digits of the discrete leaves
+        self.digits = tuple(radix for leaf in self._discrete_leaves for radix in leaf.radices)
         # Python integers: the product of many radices may overflow int64
         n_joint = len(options) if not self._discrete_leaves else 1
-        for radix in self._digits:
+        for radix in self.digits:
             n_joint *= radix
-        can_factor = self.is_shared and len(self._digits) > 1
+        can_factor = self.is_shared and len(self.digits) > 1
         if layout == "factored" and not can_factor:
             raise ValueError(f"action_layout='factored' needs several discrete parts, got {space}")
         self.is_factored = can_factor and (layout == "factored" or (layout != "joint" and n_joint > FACTORED_ABOVE))
@@ -108,7 +109,7 @@ class HybridActionSpec:
             )
         self.n_discrete_actions = n_joint
         #: numbers of values of the choices that a row makes: a single one, K, unless the space is factored
-        self.radices: tuple[int, ...] = self._digits if self.is_factored else (n_joint,)
+        self.radices: tuple[int, ...] = self.digits if self.is_factored else (n_joint,)
         if isinstance(space, spaces.OneOf):
             self._boxes = [collect_boxes(part, path, f"action_space.spaces[{i}]") for i, (path, part) in enumerate(options)]
             # The part of the native action behind the index lives under the key "option" while it is being built
@@ -159,7 +160,7 @@ class HybridActionSpec:
     @property
     def n_mask_values(self) -> int:
         """Length of the masks of all discrete parts one after the other: the sum of their numbers of values."""
-        return sum(self._digits) or self.n_discrete_actions
+        return sum(self.digits) or self.n_discrete_actions
 
     def join_masks(self, masks: np.ndarray) -> np.ndarray:
         """
@@ -167,10 +168,10 @@ class HybridActionSpec:
         :return: (n, K) booleans, whether all values of a joint discrete action may be taken; the masks as they are if the
             space is factored
         """
-        if self.is_factored or len(self._digits) <= 1:
+        if self.is_factored or len(self.digits) <= 1:
             return masks
         joint = np.ones((len(masks), 1), dtype=bool)
-        for part in np.split(masks, np.cumsum(self._digits)[:-1], axis=1):
+        for part in np.split(masks, np.cumsum(self.digits)[:-1], axis=1):
             joint = (joint[:, :, None] & part[:, None]).reshape(len(masks), -1)
         return joint
 
@@ -230,7 +231,7 @@ class HybridActionSpec:
     def _split_index(self, k: Any) -> Iterator[np.ndarray]:
         if not self.is_factored:
             # A single Discrete is by far the most common case
-            k = [k] if len(self._digits) == 1 else np.unravel_index(int(k), self._digits)
+            k = [k] if len(self.digits) == 1 else np.unravel_index(int(k), self.digits)
         digits = np.array(k)
         offset = 0
         for leaf in self._discrete_leaves:
@@ -258,7 +259,7 @@ class HybridActionSpec:
             k = np.concatenate([np.ravel(get_part(action, leaf.path)) - leaf.start for leaf in self._discrete_leaves])
             k = k.astype(np.int64)
             if not self.is_factored:
-                k = np.array([np.ravel_multi_index(tuple(k), self._digits)])
+                k = np.array([np.ravel_multi_index(tuple(k), self.digits)])
         option = 0 if self.is_shared else int(k[0])
         parameters = np.zeros(self.max_parameters)
         for box in self._boxes[option]:
