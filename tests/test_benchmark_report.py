@@ -194,4 +194,4 @@ def test_paper_command_trains_every_published_run():
     assert {(run.algo, run.env_id, run.seed) for run in runs} == published and len(runs) == len(published)
     assert {run.eval_episodes for run in runs} == {100}
     (one,) = make_runs(parse(["paper", "--algos", "hppo", "--envs", "Goal-v0", "--seeds", "10", "--steps", "50"])[0])
-    assert one.overrides == {"n_timesteps": 50}
+    assert one.overrides == {"n_timesteps": 50} and one.eval_freq is None

@@ -118,7 +118,9 @@ def make_runs(args: argparse.Namespace) -> list[Run]:
         runs = paper.published_runs(str(args.out), **common)
         wanted = ((args.envs, "env_id"), (args.algos, "algo"), (args.seeds, "seed"))
         runs = [run for run in runs if all(not chosen or getattr(run, key) in chosen for chosen, key in wanted)]
-        return [replace(run, overrides={**run.overrides, **overrides}) for run in runs]
+        # A shorter training may end before the first of the published evaluations
+        changes: dict[str, Any] = {} if args.steps is None else {"eval_freq": None}
+        return [replace(run, overrides={**run.overrides, **overrides}, **changes) for run in runs]
     return [
         Run(algo, algo, env, seed, str(args.out), overrides=overrides, eval_episodes=args.eval_episodes, **common)
         for seed in (args.seeds or (0, 1, 2))
