@@ -161,7 +161,7 @@ def test_rows_of_every_algorithm(algorithm, space, masked):
     """The environment raises for an action that is not in its space or that masks forbid."""
     env: Any = RandomMasksEnv(space) if masked else LayoutEnv(space)
     assume(algorithm.takes_factored or not HybridActionSpec(space, "shared").is_factored)
-    model = make_model(algorithm, env, action_layout="shared").learn(20)
+    model = make_model(algorithm, env, action_layout="shared" if masked else "auto").learn(20)
     masks = [env.action_masks()] * 5 if masked else None
     actions, _ = model.predict(np.zeros((5, 2), dtype=np.float32), action_masks=masks)
     assert all(space.contains(action) for action in actions)
