@@ -68,7 +68,7 @@ def test_they_run(table, name, tmp_path):
     np.testing.assert_array_equal(rows, loaded.policy.predict_rows(obs, deterministic=True))
     np.testing.assert_array_equal(rows, model.policy.predict_rows(obs, deterministic=True))
     spec, columns = model.hybrid_space.spec, model.hybrid_space.columns
-    assert not columns.view(rows, "parameters")[~spec.mask[columns.discrete_actions(rows)].astype(bool)].any()
+    assert not columns.view(rows, "parameters")[~spec.parameter_mask[columns.discrete_actions(rows)].astype(bool)].any()
     loaded.learn(10)
 
 

@@ -137,7 +137,7 @@ def test_discrete_actions_are_compared_with_parameters_of_their_own():
     # Drawn given these codewords, and as many as the action has
     ((condition,),) = conditions
     assert th.equal(condition[:, features.shape[1] :][:, : latents.shape[1]], latents)
-    assert th.equal(parameters != 0, actor.mask(k).bool())
+    assert th.equal(parameters != 0, actor.padding_mask(k).bool())
 
 
 def test_stored_parameters_value_the_latents_of_the_paper():

@@ -153,7 +153,7 @@ def test_refinement():
     """Parameters come nearer to what is worth more; the discrete action and padding stay."""
     parameters = spaces.Tuple((box(-1, 1, 1), box(-1, 1, 2)))
     model = filled_model(LayoutEnv(spaces.Tuple((spaces.Discrete(2), parameters))))
-    actor, mask = model.actor, th.as_tensor(np.array(model.hybrid_space.spec.mask)).bool()
+    actor, mask = model.actor, th.as_tensor(np.array(model.hybrid_space.spec.parameter_mask)).bool()
     assert not mask.all()
     features = random_features(actor, 50)
     noise, critic = fixed_draws(actor, 50, Selection(1)), Critic(near(0.7))

@@ -181,7 +181,7 @@ def test_usage_of_every_leaf_is_logged():
 def test_padding_reaches_nothing():
     """Rows, replay buffer and critic see 0 for parameters that the action does not have."""
     model = filled_model(make_layout_env("nested"), policy_delay=1, learning_rate=0.0)
-    mask, columns = model.hybrid_space.spec.mask.astype(bool), model.hybrid_space.columns
+    mask, columns = model.hybrid_space.spec.parameter_mask.astype(bool), model.hybrid_space.columns
     model.policy.set_foresight(0.5)
     critics = (model.critic, model.critic_target)
     calls = [calls_of(network) for critic in critics for network in (*critic.q_networks, critic.reward_network)]
@@ -203,6 +203,6 @@ def test_action_noise_spares_padding_and_is_clipped():
     model._exploration_rate = lambda: 0.0  # exploratory actions have no noise
     model.learn(60)
     data = sample(model, 64)
-    mask = model.hybrid_space.spec.mask[data.discrete_actions].astype(bool)
+    mask = model.hybrid_space.spec.parameter_mask[data.discrete_actions].astype(bool)
     assert not data.parameters[~mask].any() and data.parameters.abs().max() <= 1
     assert (data.parameters[mask].abs() == 1).float().mean() > 0.8

@@ -206,7 +206,7 @@ def test_each_part_is_varied():
 
     assert set(varied[:, 0]) == {0, 1, 2}
     assert np.abs(varied[:, 1:]).max() <= 1
-    assert not columns.view(varied, "parameters")[~spec.mask[varied[:, 0].astype(int)].astype(bool)].any()
+    assert not columns.view(varied, "parameters")[~spec.parameter_mask[varied[:, 0].astype(int)].astype(bool)].any()
 
     # One of three uniformly random discrete actions is the same by chance
     kept = varied[:, 0] == rows[:, 0]

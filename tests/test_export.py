@@ -153,7 +153,7 @@ def test_parameters_are_in_the_units_of_the_space(layout):
     with th.no_grad():
         k, parameters = (part.numpy() for part in ExportablePolicy(model.policy)(th.as_tensor(observations)))
     low, high = spec.centre - spec.half_range, spec.centre + spec.half_range
-    assert (low[k] <= parameters).all() and (parameters <= high[k]).all() and not parameters[~spec.mask[k]].any()
+    assert (low[k] <= parameters).all() and (parameters <= high[k]).all() and not parameters[~spec.parameter_mask[k]].any()
     for action, choice, own in zip(model.predict(observations, deterministic=True)[0], k, parameters, strict=True):
         row = spec.to_row(action)
         assert row[0] == choice

@@ -2,6 +2,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -9,7 +10,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper
 from torch.distributions import Categorical, Normal
 
 from sb3_chdp import HPPO
@@ -38,7 +39,7 @@ def test_log_prob_against_a_slow_loop(layout):
     for i, row in enumerate(rows):
         k = int(row[0])
         density = 0.0
-        for j in spec.parameter_index[k][spec.mask[k]]:
+        for j in spec.parameter_index[k][spec.parameter_mask[k]]:
             density += Normal(means[i, j], log_std[j].exp()).log_prob(row[1 + j])
         assert log_prob[i, 0].item() == pytest.approx(Categorical(logits=logits[i]).log_prob(row[0]).item(), abs=1e-5)
         assert log_prob[i, 1].item() == pytest.approx(th.as_tensor(density).item(), abs=1e-5)
@@ -119,6 +120,21 @@ def test_time_limits_bootstrap(vec_env_cls):
     model.learn(10)
     env.close()
     np.testing.assert_allclose(model.rollout_buffer.returns, 5.5, atol=1e-5)
+
+
+def test_without_the_last_observation_of_an_episode():
+    """As in SB3's PPO nothing bootstraps then."""
+
+    class Forgetful(VecEnvWrapper):
+        def reset(self):
+            return self.venv.reset()
+
+        def step_wait(self):
+            obs, rewards, dones, infos = self.venv.step_wait()
+            return obs, rewards, dones, [{k: v for k, v in info.items() if k != "terminal_observation"} for info in infos]
+
+    env = make_vec_env(lambda: gym.wrappers.TimeLimit(make_layout_env(), 3), 2)
+    make_model(HPPO, Forgetful(env)).learn(40)
 
 
 def test_batch_size_of_one():

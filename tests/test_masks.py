@@ -104,6 +104,16 @@ def test_masks_can_be_ignored_and_must_be_there(algorithm):
         make_model(algorithm, make_layout_env(), use_masking=True).learn(10)
 
 
+def test_own_n_step_buffers_have_to_tell_of_the_last_state():
+    class OwnBuffer(NStepReplayBuffer):
+        pass
+
+    settings = dict(replay_buffer_class=OwnBuffer, replay_buffer_kwargs=dict(n_steps=2, gamma=0.9))
+    with pytest.raises(ValueError, match=r"replay_buffer_class must be derived from HybridNStepReplayBuffer .* got <class"):
+        make_model(PDQNTD3, MaskedEnv("nested"), **settings)
+    make_model(PDQNTD3, make_layout_env(), **settings)
+
+
 @pytest.mark.parametrize("algorithm", CLASSES)
 def test_an_environment_that_allows_nothing(algorithm):
     class StuckEnv(MaskedEnv):
@@ -132,7 +142,7 @@ def test_trained_with_masks_and_then_without(tmp_path):
     make_model(PATD3, MaskedEnv(), n_steps=3).learn(40).save(tmp_path / "model")
     env = LayoutEnv(layouts()["nested"], MaskedEnv().observation_space)
     loaded = PATD3.load(tmp_path / "model", env=env, use_masking=False).learn(40)
-    assert type(loaded.replay_buffer) is NStepReplayBuffer and loaded.replay_buffer.n_steps == 3
+    assert isinstance(loaded.replay_buffer, NStepReplayBuffer) and loaded.replay_buffer.n_steps == 3
 
 
 def test_n_step_returns_of_dict_observations_are_refused():

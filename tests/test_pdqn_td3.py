@@ -23,7 +23,7 @@ def test_multi_pass_against_one_pass_per_action(layout):
     for q_net, of_all in zip(model.critic.q_networks, values, strict=True):
         for k in range(spec.n_discrete_actions):
             own = np.zeros(spec.n_parameters, dtype=np.float32)
-            own[spec.parameter_index[k][spec.mask[k]]] = 1
+            own[spec.parameter_index[k][spec.parameter_mask[k]]] = 1
             expected = q_net(th.cat([features, parameters * th.as_tensor(own)], dim=1))[:, k]
             np.testing.assert_allclose(of_all[:, k].detach(), expected.detach(), atol=1e-6)
 
@@ -88,6 +88,8 @@ def test_passthrough_is_added_and_not_trained():
     assert th.equal(model.actor.passthrough_weight, th.tensor(weight))
     with pytest.raises(ValueError, match=r"passthrough\['bias'\] must have shape \(3,\)"):
         networks(passthrough=dict(bias=[1.0]))
+    with pytest.raises(ValueError, match=r"passthrough must have no keys but \['weight', 'bias'\], got \['weights'\]"):
+        networks(passthrough=dict(weights=weight))
 
 
 def test_passthrough_stays_when_a_model_is_loaded(tmp_path):

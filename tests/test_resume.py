@@ -16,11 +16,13 @@ import pytest
 from gymnasium import spaces
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from stable_baselines3 import A2C
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from stable_baselines3.her import HerReplayBuffer
 
-from sb3_chdp import CHDP, PATD3
+from sb3_chdp import CHDP, HPPO, PATD3
 from sb3_chdp.common.buffers import PrioritizedDictReplayBuffer
 from sb3_chdp.common.resume import ResumableCheckpoint, resume
 from tests import resume_runs
@@ -197,6 +199,47 @@ def test_dict_observations(tmp_path):
         for key, rows in getattr(model.replay_buffer, name).items():
             np.testing.assert_array_equal(getattr(resumed.replay_buffer, name)[key], rows)
     np.testing.assert_array_equal(resumed.replay_buffer.priorities, model.replay_buffer.priorities)
+
+
+def test_hindsight(tmp_path):
+    class GoalWalkEnv(resume_runs.ResumableWalkEnv):
+        def __init__(self):
+            super().__init__()
+            parts = dict.fromkeys(("observation", "achieved_goal", "desired_goal"), self.observation_space)
+            self.observation_space = spaces.Dict(parts)
+
+        def _obs(self):
+            walk = super()._obs()
+            return {"observation": walk, "achieved_goal": walk, "desired_goal": np.zeros_like(walk)}
+
+        def compute_reward(self, achieved_goal, desired_goal, info):
+            return -np.abs(achieved_goal - desired_goal).sum(axis=-1)
+
+    outcomes = []
+    for parts in ([80], [40, 40]):
+        # What follows depends on the end of a training otherwise
+        settings: dict[str, Any] = dict(exploration_initial_eps=0.2, exploration_final_eps=0.2)
+        settings.update(replay_buffer_class=HerReplayBuffer, buffer_size=60, learning_starts=20)
+        model: Any = make_model(PATD3, make_env(2, env_class=GoalWalkEnv), "MultiInputPolicy", **settings)
+        for i, part in enumerate(parts):
+            folder = tmp_path / str(len(parts))
+            if i > 0:
+                model = resume(folder, make_env(2, env_class=GoalWalkEnv))
+            model.learn(part, ResumableCheckpoint(10, folder), reset_num_timesteps=False)
+        outcomes.append(model.policy.state_dict())
+    assert all(outcomes[1][name].equal(value) for name, value in outcomes[0].items())
+
+
+def test_algorithms_of_sb3(tmp_path):
+    A2C("MlpPolicy", "CartPole-v1").learn(20, ResumableCheckpoint(10, tmp_path))
+    with pytest.warns(UserWarning, match="fresh episode"):
+        assert "trusted" not in vars(resume(tmp_path, gym.make("CartPole-v1"), trusted=True))
+
+
+def test_a_training_that_went_beyond_its_end(tmp_path):
+    model = make_model(HPPO, make_env(3)).learn(50, ResumableCheckpoint(10, tmp_path))
+    resumed = resume(tmp_path, make_env(3))
+    assert model.num_timesteps == 60 == resumed.learn(50 - 60, reset_num_timesteps=False).num_timesteps
 
 
 def test_wrappers_with_a_state_of_their_own(tmp_path):

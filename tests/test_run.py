@@ -278,9 +278,9 @@ def test_policies_that_do_not_fit(algorithm):
         make_model(algorithm, make_layout_env(), policy_kwargs=[1])
 
 
-@pytest.mark.parametrize("steps", ["100", -5, float("nan")])
+@pytest.mark.parametrize("steps", ["100", float("nan")])
 def test_numbers_of_steps_that_are_none(algorithm, steps):
-    with pytest.raises(ValueError, match="total_timesteps must be a finite number of at least 0, got"):
+    with pytest.raises(ValueError, match="total_timesteps must be a finite number, got"):
         make_model(algorithm, make_layout_env()).learn(steps)
 
 

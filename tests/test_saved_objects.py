@@ -15,7 +15,8 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.utils import LinearSchedule
 
-from sb3_chdp import CHDP, HPPO, PATD3
+from sb3_chdp import CHDP, HPPO, PATD3, PaperCHDP
+from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.buffers import PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
 from sb3_chdp.common.serialization import decode, encode
 from tests.algorithms import make_model
@@ -166,6 +167,29 @@ def test_hindsight_replay_buffer(tmp_path):
     assert th.equal(samples[0].rewards, samples[1].rewards) and th.equal(samples[0].actions, samples[1].actions)
     other.load_replay_buffer(tmp_path / "buffer")
     other.learn(20, reset_num_timesteps=False)
+
+
+def test_hindsight_replay_buffer_that_is_pickled(tmp_path):
+    def make():
+        settings = dict(replay_buffer_class=HerReplayBuffer, replay_buffer_kwargs=dict(copy_info_dict=True))
+        return make_model(PATD3, GoalEnv(), "MultiInputPolicy", **settings)
+
+    model, other = make().learn(23), make()
+    model.save_replay_buffer(tmp_path / "buffer")
+    other.load_replay_buffer(tmp_path / "buffer", trusted=True)
+    assert other.replay_buffer.size() == 23
+    other.learn(20, reset_num_timesteps=False)
+
+
+def test_folders_of_pathlib(tmp_path):
+    make_model(PATD3, make_layout_env(), tensorboard_log=tmp_path).save(tmp_path / "model")
+    assert PATD3.load(tmp_path / "model").tensorboard_log == str(tmp_path)
+
+
+def test_policy_of_another_algorithm(tmp_path):
+    make_model(PaperCHDP, make_layout_env()).policy.save(tmp_path / "policy")
+    with pytest.raises(ValueError, match=r"policy is not a CHDPPolicy: it holds a sb3_chdp\.chdp\.paper\.PaperPolicy"):
+        CHDPPolicy.load(tmp_path / "policy")
 
 
 def test_files_in_memory(tmp_path):

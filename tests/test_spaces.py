@@ -87,7 +87,7 @@ def test_native_actions_are_in_the_space_and_round_trip(space, seed):
         row = spec.to_row(sample)
         native, k = spec.to_native(row), int(row[0])
         assert space.contains(native)
-        assert not row[1:][~spec.mask[k]].any()
+        assert not row[1:][~spec.parameter_mask[k]].any()
         np.testing.assert_equal(spec.to_row(native)[0], k)
         for path, leaf in executed_boxes(space, spec.is_shared, k):
             width = float(np.max(leaf.high.astype(float) - leaf.low.astype(float), initial=0.0))
@@ -119,8 +119,8 @@ def test_joint_index_is_a_bijection(radices, seed):
 def test_tables():
     spec = HybridActionSpec(layouts()["nested"])
     assert (spec.n_discrete_actions, spec.max_parameters, spec.n_parameters, spec.columns.width) == (3, 2, 3, 3)
-    assert spec.mask.sum(axis=1).tolist() == [2, 1, 0]
-    assert spec.mask.tolist() == [[True, True], [True, False], [False, False]]
+    assert spec.parameter_mask.sum(axis=1).tolist() == [2, 1, 0]
+    assert spec.parameter_mask.tolist() == [[True, True], [True, False], [False, False]]
     assert spec.parameter_index.tolist() == [[0, 1], [2, 0], [0, 0]]
     k, parameters = spec.to_native([1, 0.5, 0.9])
     assert k == 1 and parameters[1] == pytest.approx(3.75)
@@ -141,7 +141,7 @@ def test_spellings_of_an_action_without_parameters(empty):
         spaces.OneOf((box(0, 1, 1), empty)),
     ):
         spec = HybridActionSpec(space)
-        assert spec.mask.sum(axis=1).tolist() == [1, 0]
+        assert spec.parameter_mask.sum(axis=1).tolist() == [1, 0]
         assert all(space.contains(spec.to_native([k, 0.3])) for k in range(2))
 
 

@@ -5,13 +5,12 @@ import time
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
+from stable_baselines3.common.vec_env import sync_envs_normalization
 
 from sb3_chdp.benchmark.manager import RunManager
 from sb3_chdp.benchmark.results import Row, append_row, write_rows
 from sb3_chdp.benchmark.runs import Run
-from sb3_chdp.common.evaluation import evaluate_policy
+from sb3_chdp.common.evaluation import evaluate_episodes
 from sb3_chdp.common.resume import ResumableCheckpoint
 
 EVAL_SEED = 10_000
@@ -23,20 +22,6 @@ def gradient_steps_of(model: Any) -> int:
     if hasattr(model, "n_epochs"):
         return n_updates * math.ceil(model.n_steps * model.n_envs / model.batch_size)
     return n_updates
-
-
-def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int, deterministic: bool = True) -> tuple[float, float, float]:
-    """:return: success rate (nan if an episode's last info has no ``is_success``), mean return and mean length"""
-    successes: list[float] = []
-
-    def note(local_vars: dict[str, Any], _: dict[str, Any]) -> None:
-        if local_vars["done"]:
-            successes.append(float(local_vars["info"].get("is_success", math.nan)))
-
-    returns, lengths = evaluate_policy(
-        model, env, n_episodes, deterministic=deterministic, return_episode_rewards=True, callback=note, warn=False
-    )
-    return float(np.mean(successes)), float(np.mean(returns)), float(np.mean(lengths))
 
 
 class Stopwatch:
@@ -98,11 +83,11 @@ class CurveCallback(ResumableCheckpoint):
         return super()._on_step()
 
     def evaluate(self) -> None:
-        """The clock stands still meanwhile."""
+        """The clock stands still meanwhile. Success is nan if an episode does not tell it."""
         self.seconds += self._watch.lap()
         sync_envs_normalization(self.training_env, self.eval_env)
-        scores = evaluate(self.model, self.eval_env, self.run.eval_episodes, self.manager.deterministic_eval)
-        success, mean_return, length = (round(score, 4) for score in scores)
+        episodes = evaluate_episodes(self.model, self.eval_env, self.run.eval_episodes, self.manager.deterministic_eval)
+        mean_return, length, success = (round(float(np.mean(values)), 4) for values in episodes)
         self.curve.append(
             {
                 "timesteps": self.num_timesteps,

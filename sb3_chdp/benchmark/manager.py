@@ -15,7 +15,7 @@ from sb3_chdp.common.checkpoint_store import CheckpointStore
 from sb3_chdp.common.resume import resume
 from sb3_chdp.registry import ALGORITHMS
 from sb3_chdp.zoo import HybridExperimentManager, register
-from sb3_chdp.zoo_arguments import STOCK
+from sb3_chdp.zoo_arguments import STOCK, import_packages
 
 # Evaluation environments: they fill a batch of the policy
 N_EVAL_ENVS = 8
@@ -64,7 +64,7 @@ class RunManager(HybridExperimentManager):
 
 def settings_of(run: Run) -> dict[str, str]:
     """:return: the hyperparameters that a run is trained with, as text"""
-    run.import_packages()
+    import_packages(run.gym_packages)
     with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
         _, settings = RunManager(run).read_hyperparameters()
     return {key: str(value) for key, value in settings.items()}

@@ -1,6 +1,5 @@
 """What a run is: one algorithm on one environment with one seed, and where its files lie."""
 
-import importlib
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -95,11 +94,6 @@ class Run:
             training
         """
         return index * self.eval_freq if self.eval_freq else max(index * n_timesteps // N_EVALUATIONS, index)
-
-    def import_packages(self) -> None:
-        """Let the user's packages register their environments."""
-        for package in self.gym_packages:
-            importlib.import_module(package)
 
     def description(self) -> dict[str, Any]:
         """:return: what the JSON says about it, without where it was trained"""

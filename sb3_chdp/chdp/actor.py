@@ -40,7 +40,7 @@ class CooperativeActor(nn.Module):
         self.discrete_policy = discrete_policy
         self.continuous_policy = continuous_policy
         self.reads = reads
-        mask = action_space.spec.mask
+        mask = action_space.spec.parameter_mask
         self._has_padding = not bool(mask.all())
         # Not needed when no action has padding, and then not kept: K may be 65,536
         self.register_buffer(
@@ -52,7 +52,7 @@ class CooperativeActor(nn.Module):
         """Where the networks are"""
         return self.parameter_mask.device
 
-    def mask(self, k: th.Tensor) -> th.Tensor | None:
+    def padding_mask(self, k: th.Tensor) -> th.Tensor | None:
         """:return: (B, Pmax) 1 for the parameters that action k has, None if no action has padding"""
         return self.parameter_mask[k] if self._has_padding else None
 
@@ -97,7 +97,7 @@ class CooperativeActor(nn.Module):
         :return: (B, Pmax) parameters in [-1, 1], padding 0; their gradient reaches the codewords of k
         """
         condition = self.condition(features, self.codebook(k))
-        return self.continuous_policy.sample(condition, self.mask(k), noise)
+        return self.continuous_policy.sample(condition, self.padding_mask(k), noise)
 
     def random_actions(
         self, *shape: int, generator: th.Generator | None = None, masks: th.Tensor | None = None
@@ -113,5 +113,5 @@ class CooperativeActor(nn.Module):
         device = self.device if generator is None else "cpu"
         k = self.codebook.random(*shape, generator=generator, masks=masks)
         parameters = 2 * th.rand(*shape, self.continuous_policy.dim, generator=generator, device=device).to(self.device) - 1
-        mask = self.mask(k)
+        mask = self.padding_mask(k)
         return self.codebook.representative_latents(k), k, parameters if mask is None else parameters * mask

@@ -186,7 +186,7 @@ def refined(
     """
     latents, k, parameters = actions
     moves = spread * th.as_tensor(_variations(n, parameters.shape[1]), device=parameters.device)[None]
-    mask = actor.mask(k)
+    mask = actor.padding_mask(k)
     moves = moves.expand(parameters.shape[0], -1, -1) if mask is None else moves * mask[:, None]
     varied = (parameters[:, None] + moves).clamp(-1, 1)
     values = Candidates(latents[:, None].expand(-1, n, -1), k[:, None], varied).values(critic, features)

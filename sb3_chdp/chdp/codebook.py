@@ -57,7 +57,7 @@ class Codebook(nn.Module):
         Other discrete actions to try.
 
         :param k: (B,) discrete actions
-        :param n: number of alternatives to each, at most K
+        :param n: number of alternatives to each; beyond K they repeat
         :param repeatable: whether to return the same ones always
         :return: (B, n) successive discrete actions from a random one on; if ``repeatable``, evenly spread ones
         """

@@ -132,7 +132,7 @@ def vary_parts(
         k = th.as_tensor(columns.discrete_actions(random), device=policy.device)
         columns.view(of_random_k, "parameters")[:] = policy.acting_actor.sample_parameters(features, k).cpu().numpy()
 
-    mask, mask_of_random = (spec.mask[spec.options_of(columns.discrete_actions(x))] for x in (rows, random))
+    mask, mask_of_random = (spec.parameter_mask[spec.options_of(columns.discrete_actions(x))] for x in (rows, random))
     elsewhere, nearby = rows.copy(), rows.copy()
     columns.view(random, "parameters")[:] = random_parameters(rng, mask_of_random)
     columns.view(elsewhere, "parameters")[:] = random_parameters(rng, mask)

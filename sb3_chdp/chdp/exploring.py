@@ -13,6 +13,7 @@ from sb3_chdp.chdp.exploration import ReturnSums, exploration_rate, informative_
 from sb3_chdp.chdp.foresight import Claims, ForesightSums, explore
 from sb3_chdp.chdp.losses import next_values
 from sb3_chdp.chdp.policies import CHDPPolicy
+from sb3_chdp.common.arguments import is_class_of
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.rows import RETURN_PARTS
 
@@ -47,6 +48,11 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         # Those of the present step
         self._claims: Claims | None = None
 
+    def _setup_model(self) -> None:
+        # Lists in a model that is being loaded
+        self.return_sums, self.foresight_sums = ReturnSums(*self.return_sums), ForesightSums(*self.foresight_sums)
+        super()._setup_model()
+
     def _setup_learn(
         self, total_timesteps: int, callback: MaybeCallback = None, reset_num_timesteps: bool = True, *args: Any, **kwargs: Any
     ) -> tuple[int, BaseCallback]:
@@ -61,7 +67,7 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
     def _state_parts(self) -> tuple[str, ...]:
         kind = self.replay_buffer_class
         # Hindsight has other rewards than the episode had
-        has_hindsight = isinstance(kind, type) and issubclass(kind, HerReplayBuffer)
+        has_hindsight = is_class_of(kind, HerReplayBuffer)
         return (*super()._state_parts(), *(RETURN_PARTS if self.knows_returns and not has_hindsight else ()))
 
     def _exploration_rate(self) -> float:
@@ -97,12 +103,10 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
                 self.hybrid_space.columns.view(rows, name)[:, 0] = values
 
     def _count_returns(self, dones: np.ndarray) -> None:
-        returns = ReturnSums(*self.return_sums)  # a list in a loaded model
         for i in np.flatnonzero(dones):
-            returns = returns.add(self.returns_so_far[i])
+            self.return_sums = self.return_sums.add(self.returns_so_far[i])
             self.returns_so_far[i] = 0.0
-        self.return_sums = returns
-        self.n_informative_steps += informative_steps(self.n_envs, returns)
+        self.n_informative_steps += informative_steps(self.n_envs, self.return_sums)
 
     def _check_claims(
         self,
@@ -121,17 +125,16 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         came = th.as_tensor(rewards + self.gamma * (1 - dones) * values.flatten().cpu().numpy(), device=self.device)
         outputs = self.policy.value_scale.outputs(th.stack([came, came], dim=1))[:, 0]
         outcomes = outputs.clamp(-LARGEST_OUTCOME, LARGEST_OUTCOME).tolist()
-        sums = ForesightSums(*self.foresight_sums)  # a list in a loaded model
         for i, reward, follows, expected in zip(claims.envs, claims.rewards, claims.follows, claims.expected, strict=True):
             # A new episode has begun where a time limit was reached: its first state is not what followed
             if not infos[i].get("TimeLimit.truncated", False):
-                sums = sums.add(float(reward), float(follows), outcomes[i] - float(expected))
-        self.foresight_sums = sums
-        self.policy.set_foresight(sums.weight())
+                surprise = outcomes[i] - float(expected)
+                self.foresight_sums = self.foresight_sums.add(float(reward), float(follows), surprise)
+        self.policy.set_foresight(self.foresight_sums.weight())
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_claims"]
 
     def _on_step(self) -> None:
         super()._on_step()
-        self.logger.record("rollout/foresight", ForesightSums(*self.foresight_sums).weight())
+        self.logger.record("rollout/foresight", self.foresight_sums.weight())

@@ -185,6 +185,6 @@ def continuous_policy_loss(
     """
     actor, stored_k = policy.actor, replay_data.discrete_actions
     condition = actor.condition(features, actor.codebook(stored_k).detach())
-    diffusion_loss = actor.continuous_policy.diffusion_loss(replay_data.parameters, condition, actor.mask(stored_k))
+    diffusion_loss = actor.continuous_policy.diffusion_loss(replay_data.parameters, condition, actor.padding_mask(stored_k))
     parameters = actor.sample_parameters(features, k)
     return diffusion_loss, -policy.critic.score1(features, latents, parameters).mean()

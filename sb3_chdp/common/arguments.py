@@ -34,6 +34,11 @@ def is_number(value: Any) -> bool:
     return is_real and (isinstance(value, Integral) or math.isfinite(value))
 
 
+def is_class_of(value: Any, kind: type) -> bool:
+    """:return: whether this is a class, and one derived from another"""
+    return isinstance(value, type) and issubclass(value, kind)
+
+
 def whole(least: int, most: float = math.inf) -> Accepted:
     """:return: whole numbers between two bounds"""
     text = f"a whole number of at least {least}" if most == math.inf else f"a whole number between {least} and {most}"
@@ -93,7 +98,11 @@ def check(accepted: Accepted, **arguments: Any) -> None:
 
 
 def accepted_arguments(cls: type) -> dict[str, Accepted]:
-    """:return: the tables ``accepted_arguments`` of a class and its base classes, in one; the class's own come first"""
+    """
+    :param cls: an algorithm
+    :return: the tables ``accepted_arguments`` of the class and its base classes, in one; an entry of the class takes the place
+        of those of its base classes
+    """
     tables = [vars(kind).get("accepted_arguments", {}) for kind in reversed(cls.__mro__)]
     return {name: accepted for table in tables for name, accepted in table.items()}
 

@@ -27,6 +27,7 @@ from sb3_chdp.common.arguments import (
     check,
     check_arguments,
     check_load,
+    is_number,
     number,
     of_networks,
     one_of,
@@ -178,6 +179,8 @@ class HybridAlgorithm(BaseAlgorithm):
 
     def _setup_model(self) -> None:
         check_arguments(self)
+        if self.tensorboard_log is not None:
+            self.tensorboard_log = str(self.tensorboard_log)  # a Path would be pickled
         takes_dicts = issubclass(self.policy_class, self.policy_aliases.get("MultiInputPolicy", ()))
         if takes_dicts and not isinstance(self.observation_space, spaces.Dict):
             raise ValueError(
@@ -246,7 +249,8 @@ class HybridAlgorithm(BaseAlgorithm):
         self.logger.record(f"train/{name}", rate)
 
     def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        check(number(), total_timesteps=total_timesteps)
+        # Less than 0 if a training that goes on is through already
+        check(Accepted("a finite number", is_number), total_timesteps=total_timesteps)
         if self.use_masking and self.env is not None and not is_masking_supported(self.env):
             raise ValueError("use_masking is True but the environment has no method action_masks()")
         with uncounted_if_refused(self._vec_normalize_env):

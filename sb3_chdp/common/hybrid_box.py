@@ -12,7 +12,7 @@ from sb3_chdp.common.spaces import HybridActionSpec
 # Score of allowed discrete actions at least; that of others is -1
 LOWEST_ALLOWED = -0.999
 # SB3 wants bounds that are finite
-LARGEST = np.finfo(np.float32).max
+FLOAT32_MAX = np.finfo(np.float32).max
 
 
 class HybridBox(spaces.Box):
@@ -42,7 +42,7 @@ class HybridBox(spaces.Box):
             self.columns.view(low, "discrete_actions")[:] = 0
             self.columns.view(high, "discrete_actions")[:] = np.array(self.spec.radices) - 1
         for part in self.state_parts:
-            bounds = (0, 2**BITS - 1) if part in MASK_PARTS else (-LARGEST, LARGEST)
+            bounds = (0, 2**BITS - 1) if part in MASK_PARTS else (-FLOAT32_MAX, FLOAT32_MAX)
             self.columns.view(low, part)[:], self.columns.view(high, part)[:] = bounds
         super().__init__(low, high, dtype=np.float32)
 
@@ -88,7 +88,7 @@ class HybridBox(spaces.Box):
         rows = rows.copy()
         parameters = self.columns.view(rows, "parameters")
         options = self.spec.options_of(self.columns.discrete_actions(rows))
-        parameters[:] = np.clip(parameters + noise, -1, 1) * self.spec.mask[options]
+        parameters[:] = np.clip(parameters + noise, -1, 1) * self.spec.parameter_mask[options]
         return rows
 
     def __repr__(self) -> str:

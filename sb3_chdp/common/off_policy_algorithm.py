@@ -16,7 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_chdp.common.arguments import FRACTION, SWITCH, TRAIN_FREQ, Accepted, check_device, optional, whole
+from sb3_chdp.common.arguments import FRACTION, SWITCH, TRAIN_FREQ, Accepted, check, check_device, is_class_of, optional, whole
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.buffer_file import check_buffer, load_buffer, save_buffer
 from sb3_chdp.common.checks import check_numbers, check_replayed_images
@@ -29,6 +29,11 @@ from sb3_chdp.common.samples import HybridReplaySamples, name_columns
 
 # Bytes of actions in a replay buffer that deserve a warning
 LARGE_ROWS = 2**30
+# What rows say about the next state is that of the last of n steps
+TELLS_LAST = Accepted(
+    "derived from HybridNStepReplayBuffer if it is one of n steps",
+    lambda kind: not is_class_of(kind, NStepReplayBuffer) or issubclass(kind, HybridNStepReplayBuffer),
+)
 
 SelfHybridOffPolicyAlgorithm = TypeVar("SelfHybridOffPolicyAlgorithm", bound="HybridOffPolicyAlgorithm")
 
@@ -53,9 +58,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         "optimize_memory_usage": SWITCH,
         "policy_delay": whole(1),
         "action_noise": optional(Accepted("an ActionNoise of SB3's", lambda value: isinstance(value, ActionNoise))),
-        "replay_buffer_class": optional(
-            Accepted("a class of replay buffers", lambda value: isinstance(value, type) and issubclass(value, ReplayBuffer))
-        ),
+        "replay_buffer_class": optional(Accepted("a class of replay buffers", lambda value: is_class_of(value, ReplayBuffer))),
     }
     policy: HybridPolicy
 
@@ -121,15 +124,16 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         given = self.replay_buffer_class, self.replay_buffer_kwargs
         try:
             with warnings.catch_warnings():
-                self.replay_buffer_kwargs = dict(self.replay_buffer_kwargs)
-                tells_next = bool(self._state_parts())
-                if tells_next and self.n_steps != 1 and self.replay_buffer_class is None and not has_dicts:
+                kind, self.replay_buffer_kwargs = self.replay_buffer_class, dict(self.replay_buffer_kwargs)
+                if kind is None and self.n_steps != 1 and not has_dicts:
                     # In place of SB3's, which it would choose; its warning that n_steps does not count is wrong here
                     warnings.filterwarnings("ignore", message="`n_steps=")
                     self.replay_buffer_class = HybridNStepReplayBuffer
                     self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": self.n_steps, "gamma": self.gamma}
-                elif tells_next and self.replay_buffer_class is NStepReplayBuffer:
+                elif kind is NStepReplayBuffer:
                     self.replay_buffer_class = HybridNStepReplayBuffer
+                elif self._state_parts():
+                    check(TELLS_LAST, replay_buffer_class=kind)
                 super()._setup_model()
         except MemoryError as error:
             raise ValueError(
@@ -206,17 +210,17 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
             if buffer is None:
                 super().load_replay_buffer(path, truncate_last_traj)
                 buffer = self.replay_buffer
+            elif isinstance(buffer, HerReplayBuffer):
+                assert self.env is not None, "You must pass an environment at load time when using `HerReplayBuffer`"
+                buffer.set_env(self.env)
+                if truncate_last_traj:
+                    buffer.truncate_last_trajectory()
             assert buffer is not None
             check_buffer(path, buffer, own)
         except BaseException:
             self.replay_buffer = own
             raise
         self.replay_buffer = buffer
-        if isinstance(buffer, HerReplayBuffer):
-            assert self.env is not None, "You must pass an environment at load time when using `HerReplayBuffer`"
-            buffer.set_env(self.env)
-            if truncate_last_traj:
-                buffer.truncate_last_trajectory()
         buffer.device = self.device
 
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:

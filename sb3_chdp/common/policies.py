@@ -24,7 +24,7 @@ class HybridPolicy(BasePolicy):
     """
     Base class of policies for hybrid action spaces.
 
-    Networks work on rows ``[k | scaled parameters | latent]`` (:class:`HybridBox`); ``predict`` returns native actions.
+    Networks work on rows of ``action_space``, see :class:`HybridBox`; ``predict`` returns native actions.
     ``predict`` takes masks as environments give them; all other methods take what :func:`read_masks` makes of them, (n, K)
     booleans, or None.
     """
@@ -76,7 +76,7 @@ class HybridPolicy(BasePolicy):
         :param observation: the input observation
         :param deterministic: whether to return the same action for the same observation every time
         :param action_masks: (n, K) False for discrete actions that may not be taken
-        :return: rows ``[k | scaled parameters | latent]``, (n, columns) for n observations, (columns,) for one
+        :return: rows of ``action_space``, (n, columns) for n observations, (columns,) for one
         """
         obs_tensor, vectorized_env = self._checked_observation(observation)
         rows = self._rows(obs_tensor, deterministic, action_masks)

@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.her import HerReplayBuffer
 from torch import device
 
 from sb3_chdp.common.checkpoint_store import GenerationWriter
@@ -42,8 +43,11 @@ def buffer_state(buffer: ReplayBuffer) -> dict[str, Any]:
     :raises ValueError: if it keeps something else than numbers
     """
     harmless = (spaces.Space, VecEnv, device, type)
+    # Those of a buffer that does not copy them are empty
+    without_infos = isinstance(buffer, HerReplayBuffer) and not buffer.copy_info_dict
+    elsewhere = (*ROW_ARRAYS, "infos") if without_infos else ROW_ARRAYS
     for name, value in vars(buffer).items():
-        if not is_setting(buffer, name) and name not in ROW_ARRAYS and not is_plain(value) and not isinstance(value, harmless):
+        if not is_setting(buffer, name) and name not in elsewhere and not is_plain(value) and not isinstance(value, harmless):
             raise ValueError(f"Checkpoints hold no {type(buffer).__name__}: its {name} is not numbers but {type(value)}")
     return state_of(buffer, ignored=ROW_ARRAYS)
 

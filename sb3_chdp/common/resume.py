@@ -1,5 +1,6 @@
 """Training that is killed at any moment and goes on as if it had not been."""
 
+import inspect
 import io
 import tempfile
 import time
@@ -236,7 +237,9 @@ def _algorithm(name: str) -> type[BaseAlgorithm]:
     raise ValueError(f"The checkpoint is one of {name}: import that class first")
 
 
-def resume(directory: str | Path, env: GymEnv, device: th.device | str = "auto", **kwargs: Any) -> BaseAlgorithm:
+def resume(
+    directory: str | Path, env: GymEnv, device: th.device | str = "auto", trusted: bool = False, **kwargs: Any
+) -> BaseAlgorithm:
     """
     The model of the newest checkpoint that is whole, ready to go on with ``learn``:
 
@@ -250,6 +253,7 @@ def resume(directory: str | Path, env: GymEnv, device: th.device | str = "auto",
     :param directory: ``save_path`` of the :class:`ResumableCheckpoint`
     :param env: the environment, made like that of the killed training
     :param device: Device on which the code should be run
+    :param trusted: whether pickled objects may be read, see :meth:`HybridAlgorithm.load`; SB3's own algorithms always do
     :param kwargs: further arguments of the algorithm's ``load``
     :return: the model, with its replay buffer, environment and random generators where they were
     :raises FileNotFoundError: if there is no checkpoint
@@ -264,6 +268,8 @@ def resume(directory: str | Path, env: GymEnv, device: th.device | str = "auto",
         raise ValueError(f"env must have {state['n_envs']} environment(s) like the checkpoint, got {vec_env.num_envs}")
     if class_names(vec_env) != state["vec_wrappers"]:
         raise ValueError(f"env must be wrapped in {state['vec_wrappers']} like the checkpoint, got {class_names(vec_env)}")
+    if "trusted" in inspect.signature(algorithm.load).parameters:
+        kwargs["trusted"] = trusted
     model = algorithm.load(folder / "model.zip", env=vec_env, device=device, force_reset=False, **kwargs)
     restore_model(model, state["model"])
     buffer = _replay_buffer(model)

@@ -200,7 +200,7 @@ def misfit(path: Any, version: str, error: Exception, changes: dict[str, Any]) -
     """:return: the error for a file of another version, or loaded with other arguments, that does not fit"""
     reason = str(error).strip().partition("\n")[0]
     if version == VERSION:
-        return ValueError(f"{path} does not fit the arguments given to load(), {', '.join(changes)}: {reason}")
+        return ValueError(f"{path} was not loaded with {', '.join(changes)}: {type(error).__name__}: {reason}")
     return ValueError(f"{path} was saved by sb3_chdp {version} and does not fit sb3_chdp {VERSION}: {reason}")
 
 
@@ -242,5 +242,8 @@ def load_policy(cls: Any, path: PathOrFile, device: th.device | str) -> Any:
         arguments = decode(json.loads(archive.read("data")))
         state_dict = th.load(io.BytesIO(archive.read("policy.pth")), map_location="cpu", weights_only=True)
     policy = cls(**arguments)
-    policy.load_state_dict(state_dict)
+    try:
+        policy.load_state_dict(state_dict)
+    except RuntimeError as error:
+        raise ValueError(f"{name} is not a {cls.__name__}: it holds a {header.classes[0]}") from error
     return policy.to(get_device(device))

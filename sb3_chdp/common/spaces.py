@@ -122,7 +122,7 @@ class HybridActionSpec:
         self._build_tables()
 
     def _build_tables(self) -> None:
-        """Fill the (K, Pmax) tables: mask, centre and half range of every parameter, column in the concatenated vector."""
+        """Fill the (K, Pmax) tables: which parameters there are, centres, half ranges, columns in the concatenated vector."""
         sizes = [boxes[-1].columns.stop if boxes else 0 for boxes in self._boxes]
         self.max_parameters = max(sizes)
         self.columns = RowLayout(discrete_actions=len(self.radices), parameters=self.max_parameters)
@@ -142,7 +142,7 @@ class HybridActionSpec:
         index = np.where(mask, offsets[:-1, None] + np.arange(self.max_parameters), 0)
         # A shared layout has a single option that serves all K actions; in a factored one these are not to be counted
         shape = (1 if self.is_factored else self.n_discrete_actions, self.max_parameters)
-        self.mask, self.centre, self.half_range, self.parameter_index = (
+        self.parameter_mask, self.centre, self.half_range, self.parameter_index = (
             np.broadcast_to(table, shape) for table in (mask, centre, half, index)
         )
 
@@ -178,12 +178,12 @@ class HybridActionSpec:
     def options_of(self, choices: Array) -> Array:
         """
         :param choices: (n,) discrete actions, (n, L) of a factored space
-        :return: (n,) their rows in the tables of parameters: ``mask`` and ``parameter_index``
+        :return: (n,) their rows in the tables of parameters: ``parameter_mask`` and ``parameter_index``
         """
         return choices if choices.ndim == 1 else choices[:, 0] * 0
 
     def __repr__(self) -> str:
-        sizes = sorted({*self.mask.sum(axis=1).tolist()})
+        sizes = sorted({*self.parameter_mask.sum(axis=1).tolist()})
         discrete = f"{len(self.radices)} choices" if self.is_factored else f"{self.n_discrete_actions} discrete actions"
         of_actions = f"{sizes[0]} shared parameters" if self.is_shared else f"{' or '.join(map(str, sizes))} parameters each"
         return f"HybridActionSpec({discrete}, {of_actions})"
@@ -294,7 +294,7 @@ class HybridActionSpec:
         :return: (n, 1 + Pmax) rows, k uniform over the K actions, parameters uniform in [-1, 1], padding 0
         """
         choices = self.sample_choices(rng, n, masks)
-        parameters = rng.uniform(-1.0, 1.0, size=(n, self.max_parameters)) * self.mask[self.options_of(choices)]
+        parameters = rng.uniform(-1.0, 1.0, size=(n, self.max_parameters)) * self.parameter_mask[self.options_of(choices)]
         return self.columns.pack(discrete_actions=choices, parameters=parameters)
 
     def own_parameters(self, choices: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -304,5 +304,5 @@ class HybridActionSpec:
         :return: (n, 1 + Pmax) rows of the chosen actions with their own parameters
         """
         options = self.options_of(choices)
-        own_parameters = np.take_along_axis(parameters, self.parameter_index[options], axis=1) * self.mask[options]
+        own_parameters = np.take_along_axis(parameters, self.parameter_index[options], axis=1) * self.parameter_mask[options]
         return self.columns.pack(discrete_actions=choices, parameters=own_parameters)

@@ -41,7 +41,7 @@ class HybridDistribution(DiagGaussianDistribution):
         self.categorical = self._make_categorical()
         self._masks: MaybeMasks = None
         self._parameter_index = th.tensor(spec.parameter_index)
-        self._parameter_mask = th.tensor(spec.mask, dtype=th.float32)
+        self._parameter_mask = th.tensor(spec.parameter_mask, dtype=th.float32)
 
     def _make_categorical(self) -> MaskableCategoricalDistribution | MaskableMultiCategoricalDistribution:
         radices = self.columns.radices

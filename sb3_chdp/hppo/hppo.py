@@ -221,9 +221,10 @@ class HPPO(HybridAlgorithm, PPO):
 
             self._update_info_buffer(infos, dones)
             for i in np.flatnonzero(dones):
+                terminal_obs = infos[i].get("terminal_observation")
                 # Time limits bootstrap
-                if infos[i].get("TimeLimit.truncated", False):
-                    terminal_obs = self.policy.obs_to_tensor(infos[i]["terminal_observation"])[0]
+                if terminal_obs is not None and infos[i].get("TimeLimit.truncated", False):
+                    terminal_obs = self.policy.obs_to_tensor(terminal_obs)[0]
                     with th.no_grad():
                         rewards[i] += self.gamma * self.policy.predict_values(terminal_obs).item()
             rollout_buffer.add(self._last_obs, actions, rewards, self._last_episode_starts, values, log_probs)

@@ -14,9 +14,9 @@ from huggingface_hub import HfApi
 from huggingface_sb3 import EnvironmentName, ModelName
 from rl_zoo3.utils import ALGOS, create_test_env, get_model_path, get_saved_hyperparams
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_chdp.common.evaluation import evaluate_episodes
 from sb3_chdp.envs.recorder import FrameVideoRecorder
 from sb3_chdp.hub.card import Evaluation, make_card
 
@@ -46,18 +46,6 @@ def make_parser() -> argparse.ArgumentParser:
     add("--seed", type=int, default=0, help="seed of the episodes (default: 0)")
     add("--no-upload", action="store_true", help=f"write the repository into the folder {LOCAL} and look at it first")
     return parser
-
-
-def evaluate(model: BaseAlgorithm, env: VecEnv, n_episodes: int) -> Evaluation:
-    """:return: so many deterministic episodes"""
-    successes: list[float] = []
-
-    def note(local_vars: dict[str, Any], _: dict[str, Any]) -> None:
-        if local_vars["done"] and local_vars["info"].get("is_success") is not None:
-            successes.append(float(local_vars["info"]["is_success"]))
-
-    returns, _ = evaluate_policy(model, env, n_episodes, return_episode_rewards=True, callback=note, warn=False)
-    return Evaluation(np.array(returns).tolist(), successes if len(successes) == n_episodes else [])
 
 
 def record(model: BaseAlgorithm, env: VecEnv, length: int, path: Path) -> None:
@@ -104,7 +92,8 @@ def make_repository(args: argparse.Namespace, folder: Path) -> str:
         env_kwargs={**env_kwargs, **render},
     )
     model = ALGOS[algo].load(model_path, env=env, device="cpu")
-    evaluation = evaluate(model, env, args.eval_episodes)
+    returns, _, successes = evaluate_episodes(model, env, args.eval_episodes)
+    evaluation = Evaluation(np.array(returns).tolist(), [] if np.isnan(successes).any() else successes)
     if args.no_render:
         env.close()
     else:

@@ -46,7 +46,7 @@ class HyARTD3Policy(HybridTD3Policy):
         if spec.is_factored:
             self.representation = FactoredActionRepresentation(features_dim, spec.radices, spec.max_parameters, *latent_dims)
         else:
-            self.representation = ActionRepresentation(features_dim, th.tensor(spec.mask), *latent_dims)
+            self.representation = ActionRepresentation(features_dim, th.tensor(spec.parameter_mask), *latent_dims)
         make: Callable[..., th.optim.Optimizer] = self.optimizer_class
         # The learning rate is set before every update
         self.representation_optimizer = make(self.representation.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)

@@ -43,7 +43,10 @@ class ParameterActor(Actor):
         self.inverting_gradients = inverting_gradients
         self.mu = nn.Sequential(*create_mlp(self.features_dim, n_parameters, self.net_arch, self.activation_fn))
         self.squash = InvertingGradients() if inverting_gradients else nn.Tanh()
-        for name, shape in (("weight", (n_parameters, self.features_dim)), ("bias", (n_parameters,))):
+        shapes = {"weight": (n_parameters, self.features_dim), "bias": (n_parameters,)}
+        if not set(passthrough or {}) <= set(shapes):
+            raise ValueError(f"passthrough must have no keys but {list(shapes)}, got {list(passthrough or {})}")
+        for name, shape in shapes.items():
             values = th.as_tensor((passthrough or {}).get(name, th.zeros(shape)), dtype=th.float32)
             if values.shape != shape:
                 raise ValueError(f"passthrough[{name!r}] must have shape {shape}, got {tuple(values.shape)}")
@@ -105,7 +108,7 @@ class ParameterizedQNetwork(BaseModel):
             for _ in range(2)
         )
         self.register_buffer("parameter_index", th.tensor(spec.parameter_index), persistent=False)
-        self.register_buffer("parameter_mask", th.tensor(spec.mask, dtype=th.float32), persistent=False)
+        self.register_buffer("parameter_mask", th.tensor(spec.parameter_mask, dtype=th.float32), persistent=False)
 
     def features(self, obs: PyTorchObs) -> th.Tensor:
         """:return: (B, features_dim) features of the observations"""
