@@ -33,6 +33,7 @@ from sb3_chdp.zoo_arguments import (
     STOCK,
     ArgumentsError,
     check_env,
+    check_hyperparams,
     check_renders,
     complete,
     import_packages,
@@ -77,6 +78,13 @@ def prepare_arguments(command: str, arguments: list[str]) -> list[str]:
         return arguments
     if command in READERS:
         arguments = complete(command, arguments)
+    for name in ALGORITHMS:
+        if any(argument.rpartition("=")[2] == STOCK + name for argument in arguments):
+            raise ArgumentsError(f"{STOCK}{name}: {name} is of this package, leave out {STOCK}")
+    check_hyperparams(arguments)
+    config = option(arguments, "-conf", "--conf-file")
+    if config is not None and config.endswith(".yml") and not os.path.isfile(config):
+        raise ArgumentsError(f"-conf: there is no file {config}")
     arguments = [argument.removeprefix(STOCK).replace(f"={STOCK}", "=", 1) for argument in arguments]
     if command in ("plot", "all_plots"):
         # The scripts that read folders do not know how rl_zoo3 names that of an id with a slash

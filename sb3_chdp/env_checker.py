@@ -53,7 +53,7 @@ def check_hybrid_env(env: gym.Env, action_layout: str = "auto", warn: bool = Tru
     player.play_extremes()
     player.play_episodes()
     if warn:
-        for sentence in [_unusual_space(spec), *player.oddities(), player.seed_oddity()]:
+        for sentence in [*player.oddities(), player.seed_oddity(), player.layout_oddity() or _unusual_space(spec)]:
             if sentence is not None:
                 warnings.warn(sentence, stacklevel=2)
     flat = FlattenHybridAction(env, action_layout)
@@ -63,6 +63,8 @@ def check_hybrid_env(env: gym.Env, action_layout: str = "auto", warn: bool = Tru
 def _check_is_env(env: Any) -> None:
     if isinstance(env, type):
         raise AssertionError(f"env is the class {env.__name__}: give an object of it, {env.__name__}()")
+    if isinstance(env, str):
+        raise AssertionError(f"env is a name: give the environment, gymnasium.make({env!r})")
     if isinstance(env, (VecEnv, gym.vector.VectorEnv)):
         raise AssertionError(f"env is a {type(env).__name__}, which holds several environments: give one of them")
     if not isinstance(env, gym.Env):
@@ -82,8 +84,8 @@ def _unusual_space(spec: HybridActionSpec) -> str | None:
         parts = [name_of(path) for path, _ in found[1]]
         if all(len(path) == 1 for path, _ in found[1]):
             return (
-                f"The discrete actions 0, 1, ... have the parameters {', '.join(parts)}, one box each: give "
-                "action_layout='per_action' if this is meant, and 'shared' if every action has all of them"
+                f"The discrete actions 0, 1, ... have the parameters {', '.join(parts)}, one box each: give the algorithm, "
+                "and this function, action_layout='per_action' if this is meant, and 'shared' if every action has all of them"
             )
     return None
 
@@ -266,22 +268,43 @@ class _Player:
 
     def seed_oddity(self) -> str | None:
         """:return: what is wrong if two runs with one seed differ"""
-        runs = []
-        for _ in range(2):
-            rng = np.random.default_rng(1)
-            run: list[Any] = [deepcopy(self.reset(seed=1))]
-            for _ in range(N_COMPARED):
-                answer = self.step(self.spec.to_native(self._random_row(rng)))
-                run.append(deepcopy(answer))
-                if answer[2] or answer[3]:
-                    break
-            runs.append(run)
-        if data_equivalence(runs[0], runs[1]):
+        if data_equivalence(self._run(), self._run()):
             return None
         return (
             "Two runs with reset(seed=1) and the same actions differ: call super().reset(seed=seed) and draw random numbers "
             "from self.np_random only, so that trainings can be repeated"
         )
+
+    def layout_oddity(self) -> str | None:
+        """:return: what is wrong if two runs differ by nothing but parameters of actions that are not chosen"""
+        if self.spec.is_shared or data_equivalence(self._run(others_at=-1), self._run(others_at=1)):
+            return None
+        if self.seed_oddity() is not None:
+            return None
+        return (
+            "Parameters of other actions than the chosen one have an effect. If every action has all of them, give the "
+            "algorithm, and this function, action_layout='shared'. Else put them in the order of the actions: action 0 has "
+            f"{self.spec.names_of(0)}, action 1 {self.spec.names_of(1)}, and so on; a Dict sorts its keys"
+        )
+
+    def _run(self, others_at: int | None = None) -> list[Any]:
+        """
+        :param others_at: -1: parameters of actions that are not chosen are at their lower bounds, 1: at the upper ones; None:
+            in the middle
+        :return: what comes of random actions after ``reset(seed=1)``
+        """
+        rng = np.random.default_rng(1)
+        run: list[Any] = [deepcopy(self.reset(seed=1))]
+        for _ in range(N_COMPARED):
+            row = self._random_row(rng)
+            action = self.spec.to_native(row)
+            if others_at is not None:
+                action = self.spec.with_others(action, int(row[0]), others_at)
+            answer = self.step(action)
+            run.append(deepcopy(answer))
+            if answer[2] or answer[3]:
+                break
+        return run
 
 
 def _types(answer: Any) -> str:

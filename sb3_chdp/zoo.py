@@ -83,6 +83,11 @@ class HybridExperimentManager(ExperimentManager):
             hyperparams.update(of_trial)
             saved.update(of_trial)
             print(f"Settings of trial 0: {of_trial}")
+        for settings in (hyperparams, saved):
+            settings.setdefault("policy", "MlpPolicy")
+            settings.setdefault("n_timesteps", self.n_timesteps)
+        if hyperparams["n_timesteps"] <= 0:
+            raise ArgumentsError(f"-n says for how many steps: the file {self.config} does not")
         if hyperparams.get("env_kwargs") and not self.env_kwargs:
             # Those of the YAML file are for evaluation too
             self.env_kwargs = hyperparams["env_kwargs"]
@@ -177,15 +182,16 @@ def _policy_for(space: gym.Space[Any]) -> str:
     return "CnnPolicy" if is_image_space(space) else "MlpPolicy"
 
 
-def _add_wrapper(settings: dict[str, Any], key: str, wrapper: str) -> None:
+def _add_wrapper(settings: dict[str, Any], key: str, wrapper: str, **kwargs: Any) -> None:
     """Put a wrapper around those that the settings name, unless it is one of them."""
     wrappers = settings.get(key) or []
     wrappers = [wrappers] if isinstance(wrappers, (str, dict)) else list(wrappers)
     if wrapper not in str(wrappers):
-        settings[key] = [*wrappers, wrapper]
+        settings[key] = [*wrappers, {wrapper: kwargs} if kwargs else wrapper]
 
 
 def _flatten(settings: dict[str, Any]) -> None:
     """Wrap the environment, and normalise as the algorithms of this package do unless told otherwise."""
-    _add_wrapper(settings, "env_wrapper", FLATTEN)
+    layout = {"action_layout": settings.pop("action_layout")} if "action_layout" in settings else {}
+    _add_wrapper(settings, "env_wrapper", FLATTEN, **layout)
     settings.setdefault("normalize", True)

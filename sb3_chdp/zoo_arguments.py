@@ -1,5 +1,6 @@
 """Arguments of the command line: what users need not say, and hints about what they said."""
 
+import builtins
 import difflib
 import importlib
 from collections.abc import Iterable
@@ -90,6 +91,20 @@ def import_packages(packages: Iterable[str]) -> None:
             raise ArgumentsError(
                 f"--gym-packages: there is no module {package!r} in the current folder or among the installed packages"
             ) from None
+
+
+def check_hyperparams(arguments: list[str]) -> None:
+    """
+    :param arguments: command line
+    :raises ArgumentsError: for a setting that is not ``KEY:VALUE`` with a value of Python's
+    """
+    names = ("-params", "--hyperparams")
+    for setting in [setting for name in names for setting in split_option(arguments, name)[1]]:
+        key, _, value = setting.partition(":")
+        if not value:
+            raise ArgumentsError(f"-params {setting}: write KEY:VALUE, for example gamma:0.9")
+        if value.isidentifier() and value not in vars(builtins):
+            raise ArgumentsError(f"-params {setting}: texts need quotes, -params \"{key}:'{value}'\"")
 
 
 def check_env(env_id: str | None) -> None:

@@ -184,6 +184,7 @@ ERRORS = {
         lambda: walk(action_space=layouts()["dict"], reward=lambda self, action: action["values"][0] + 1.0),
         "return float(reward). It works with numbers in place of arrays of one element",
     ),
+    "a_name": (lambda: "Goal-v0", "env is a name: give the environment, gymnasium.make('Goal-v0')"),
     "own_contains": (
         lambda: walk(action_space=type("Own", (spaces.Tuple,), {"contains": lambda self, x: False})(ACTIONS.spaces)),
         "but env.action_space.contains() says no",
@@ -197,6 +198,19 @@ WARNINGS = {
     "one_box_each": (
         lambda: walk(action_space=spaces.Dict(lift=spaces.Discrete(2), x=PLANE, y=PLANE)),
         "discrete actions 0, 1, ... have the parameters action_space['x'], action_space['y'], one box each: give",
+    ),
+    "one_box_for_all": (
+        lambda: walk(
+            action_space=spaces.Tuple((spaces.Discrete(2), PLANE, PLANE)), reward=lambda self, action: float(action[2][0])
+        ),
+        "have an effect. If every action has all of them, give the algorithm, and this function, action_layout='shared'.",
+    ),
+    "sorted_keys": (
+        lambda: walk(
+            action_space=spaces.Tuple((spaces.Discrete(2), spaces.Dict({"run": PLANE, "hop": PLANE}))),
+            reward=lambda self, action: float(action[1][["run", "hop"][action[0]]][0]),
+        ),
+        "action 0 has action_space[1]['hop'], action 1 action_space[1]['run'], and so on; a Dict sorts its keys",
     ),
     "no_end": (
         lambda: walk(terminated=False, truncated=False),
@@ -226,6 +240,10 @@ SOUND = {
     "walk": Walk,
     "success_at_the_end_only": lambda: walk(terminated=False, info=lambda self: {"is_success": True} if self.t == 20 else {}),
     "forbidden_actions": MaskedEnv,
+    "own_parameters": lambda: walk(
+        action_space=spaces.Tuple((spaces.Discrete(2), spaces.Dict({"run": PLANE, "hop": PLANE}))),
+        reward=lambda self, action: float(action[1][["hop", "run"][action[0]]][0]),
+    ),
 }
 
 

@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import (
     VecTransposeImage,
 )
 
-from sb3_chdp import CHDP, PATD3, FlattenHybridAction, HyARTD3, check_hybrid_env
+from sb3_chdp import CHDP, HPPO, PATD3, FlattenHybridAction, HyARTD3, check_hybrid_env
 from tests.algorithms import LAYOUTS, OFF_POLICY_ALGORITHMS, has_learnt, make_model, snapshot
 from tests.hybrid_envs import LayoutEnv, box, layouts, make_layout_env
 
@@ -251,11 +251,18 @@ def test_actions_that_are_not_hybrid(algorithm, space):
 
 @pytest.mark.parametrize(
     ("env", "message"),
-    [(LayoutEnv, r"got the class LayoutEnv: give an object of it, LayoutEnv\(\)"), (3, "got 3")],
-    ids=str,
+    [
+        (LayoutEnv, r"an environment, got the class LayoutEnv: give an object of it, LayoutEnv\(\)"),
+        (3, "an environment of .* got 3"),
+        (
+            gym.make_vec("sb3_chdp/Goal-v0", 2, "sync"),
+            r"a VecEnv of SB3's, as make_vec_env\(\) .* got Gymnasium's SyncVectorEnv",
+        ),
+    ],
+    ids=["class", "number", "vector"],
 )
 def test_what_is_no_environment(algorithm, env, message):
-    with pytest.raises(ValueError, match=f"env must be an environment.*{message}"):
+    with pytest.raises(ValueError, match=f"env must be {message}"):
         make_model(algorithm, env)
 
 
@@ -276,6 +283,11 @@ def test_policies_that_do_not_fit(algorithm):
         make_model(algorithm, make_layout_env(), policy_kwargs=dict(activation_fn="relu"))
     with pytest.raises(ValueError, match=r"policy_kwargs must be a dict, or None, got \[1\]"):
         make_model(algorithm, make_layout_env(), policy_kwargs=[1])
+
+
+def test_network_of_a_wrong_name():
+    with pytest.raises(ValueError, match=r"net_arch must have no keys but 'pi' and 'vf', got \{'pi'"):
+        make_model(HPPO, make_layout_env(), policy_kwargs=dict(net_arch=dict(pi=[8], qf=[8])))
 
 
 @pytest.mark.parametrize("steps", ["100", float("nan")])

@@ -7,7 +7,16 @@ import gymnasium as gym
 import pytest
 
 from sb3_chdp.cli import COMMANDS, prepare_arguments
-from sb3_chdp.zoo_arguments import ArgumentsError, check_env, check_renders, complete, import_packages, option, split_option
+from sb3_chdp.zoo_arguments import (
+    ArgumentsError,
+    check_env,
+    check_hyperparams,
+    check_renders,
+    complete,
+    import_packages,
+    option,
+    split_option,
+)
 from tests.hybrid_envs import make_layout_env
 
 
@@ -77,6 +86,25 @@ def test_no_such_run(logs, command, arguments, message):
 )
 def test_algorithm(command, arguments, prepared):
     assert prepare_arguments(command, arguments.split()) == prepared.split()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("-params gamma=0.9", "-params gamma=0.9: write KEY:VALUE, for example gamma:0.9"),
+        ("-params gamma:1 action_layout:shared", "texts need quotes, -params \"action_layout:'shared'\""),
+        ("--algo sb3:chdp", "sb3:chdp: chdp is of this package, leave out sb3:"),
+        ("--algo=sb3:hppo", "sb3:hppo: hppo is of this package, leave out sb3:"),
+        ("-conf nowhere.yml", "-conf: there is no file nowhere.yml"),
+    ],
+)
+def test_slips(arguments, message):
+    with pytest.raises(ArgumentsError, match=re.escape(message)):
+        prepare_arguments("train", arguments.split())
+
+
+def test_settings_that_are_sound():
+    check_hyperparams(["-params", "gamma:0.9", "seed:None", "policy_kwargs:dict(net_arch=[64])", "layout:'shared'"])
 
 
 @pytest.mark.parametrize(

@@ -39,7 +39,11 @@ gym.register("Own-v0", OwnEnv, max_episode_steps=5)
     "algo, settings, run_that",
     [
         ("hppo", ["n_steps:5", "batch_size:10"], []),
-        ("sb3:sac", ["learning_starts:20", "buffer_size:100"], ["--algo", "sb3:sac", "--env", "Own-v0"]),
+        (
+            "sb3:sac",
+            ["learning_starts:20", "buffer_size:100", "action_layout:'shared'"],
+            ["--algo", "sb3:sac", "--env", "Own-v0"],
+        ),
     ],
     ids=["the last run", "the run that is named"],
 )
@@ -59,6 +63,15 @@ def test_own_environment(algo, settings, run_that, tmp_path):
     assert (tmp_path / "plot.png").is_file() and (tmp_path / "all.png").is_file()
     message = run("enjoy", "--no-render", cwd=tmp_path, code=1)
     assert message == "sb3-chdp enjoy: unknown environment 'Own-v0' (--gym-packages names the module that registers it)\n"
+
+
+def test_settings_that_say_little(tmp_path):
+    """Policy and number of steps need not stand in a file."""
+    (tmp_path / "mine.py").write_text(OWN_ENV)
+    (tmp_path / "mine.yml").write_text("Own-v0: {n_steps: 5, batch_size: 10}")
+    arguments = ["train", "--algo", "hppo", "--env", "Own-v0", "--gym-packages", "mine", "-conf", "mine.yml"]
+    run(*arguments, "-n", "20", "--eval-freq", "-1", cwd=tmp_path)
+    assert run(*arguments, cwd=tmp_path, code=1).endswith("-n says for how many steps: the file mine.yml does not\n")
 
 
 def test_observations_that_cannot_be_normalized(tmp_path):

@@ -28,7 +28,7 @@ from sb3_chdp.benchmark.results import ResultsError, read_results
 from sb3_chdp.benchmark.runs import Run
 from sb3_chdp.benchmark.statistics import scores_of
 from sb3_chdp.registry import ALGORITHMS
-from sb3_chdp.zoo_arguments import STOCK, import_packages, unknown
+from sb3_chdp.zoo_arguments import STOCK, check_hyperparams, import_packages, unknown
 
 SLURM = "--slurm-"
 
@@ -75,6 +75,7 @@ def parse(arguments: list[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
             continue
         name, _, value = word.partition("=")
         options[name[2:].replace("-", "_")] = yaml.safe_load(value or next(words, ""))
+    check_hyperparams(rest)
     args = parser.parse_args(rest)
     if options and args.cluster != "slurm":
         parser.error(f"{SLURM}... needs --cluster slurm")

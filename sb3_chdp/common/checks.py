@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, unwrap_vec_normalize
@@ -50,6 +51,8 @@ def check_is_env(env: Any) -> None:
     """
     if isinstance(env, type):
         raise ValueError(f"env must be an environment, got the class {env.__name__}: give an object of it, {env.__name__}()")
+    if isinstance(env, gym.vector.VectorEnv):
+        raise ValueError(f"env must be a VecEnv of SB3's, as make_vec_env() returns it, got Gymnasium's {type(env).__name__}")
     if not hasattr(env, "observation_space"):
         raise ValueError(f"env must be an environment of Gymnasium's, a VecEnv of SB3's, or an id, got {env!r}")
 

@@ -138,7 +138,8 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         except MemoryError as error:
             raise ValueError(
                 f"buffer_size must be such that the replay buffer fits into the memory, got {self.buffer_size}: {error}. "
-                "optimize_memory_usage=True halves what observations need"
+                "With replay_buffer_kwargs=dict(handle_timeout_termination=False), optimize_memory_usage=True halves what "
+                "observations need"
             ) from error
         finally:
             # What follows from other arguments is chosen anew when the model is loaded with other ones

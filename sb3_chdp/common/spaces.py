@@ -21,6 +21,7 @@ from sb3_chdp.common.space_tree import (
     find_options,
     get_part,
     is_parameter_space,
+    name_of,
     replace_part,
     template_action,
 )
@@ -244,6 +245,21 @@ class HybridActionSpec:
         if isinstance(leaf.space, spaces.Discrete):
             return leaf.space.dtype.type(values[0])
         return values.reshape(leaf.space.shape).astype(leaf.space.dtype)
+
+    def with_others(self, action: Any, k: int, side: int) -> Any:
+        """
+        :param action: a native action
+        :param k: its discrete action
+        :param side: -1 or 1
+        :return: the same with the parameters of all other actions at their lower (-1) or upper (1) bounds
+        """
+        for box in (box for i, boxes in enumerate(self._boxes) if i != k for box in boxes if box.path[0] != "option"):
+            action = replace_part(action, box.path, (box.space.low if side < 0 else box.space.high).copy())
+        return action
+
+    def names_of(self, k: int) -> str:
+        """:return: the boxes of a discrete action"""
+        return ", ".join(name_of(box.path) for box in self._boxes[k]) or "no parameters"
 
     def to_row(self, action: Any) -> np.ndarray:
         """

@@ -24,6 +24,10 @@ class HPPOPolicy(HybridPolicy, ActorCriticPolicy):
     action_dist: HybridDistribution
 
     def __init__(self, *args: Any, **kwargs: Any):
+        net_arch = kwargs.get("net_arch")
+        if isinstance(net_arch, dict) and not net_arch.keys() <= {"pi", "vf"}:
+            # The network that is not named would have no hidden layer
+            raise ValueError(f"net_arch must have no keys but 'pi' and 'vf', got {net_arch}")
         super().__init__(*args, **{"log_std_init": -0.5, **kwargs})
 
     def _build(self, lr_schedule: Schedule) -> None:

@@ -142,6 +142,8 @@ class HyARTD3(HybridTD3):
     def train(self, gradient_steps: int, batch_size: int = 128) -> None:
         if self._n_updates >= self._next_representation_update:
             warm_up = self._next_representation_update == 0
+            if warm_up and self.verbose >= 1:
+                print(f"Learning the representation of actions for {self.representation_warmup_steps} gradient steps")
             self._train_representation(self.representation_warmup_steps if warm_up else self.representation_steps)
             self._next_representation_update = self._n_updates + self.representation_freq
         super().train(gradient_steps, batch_size)
