@@ -72,8 +72,8 @@ class BitsEnv(gym.Env):
 @pytest.mark.parametrize(
     "space, layout, radices",
     [
-        (bits_space(10), "auto", (1024,)),
-        (bits_space(11), "auto", (2,) * 11),
+        (bits_space(6), "auto", (64,)),
+        (bits_space(7), "auto", (2,) * 7),
         (bits_space(11), "shared", (2,) * 11),
         (bits_space(11), "joint", (2048,)),
         (bits_space(2), "factored", (2, 2)),
@@ -157,7 +157,7 @@ def test_buffers_grow_with_the_sum_of_the_radices(algorithm):
 def test_a_large_buffer_says_what_it_will_take():
     # None of it is used
     with pytest.warns(UserWarning, match=r"will take 1\.2 GB: 1025 numbers for each of buffer_size=300000"):
-        make_model(PATD3, LayoutEnv(bits_space(10)), buffer_size=300_000)
+        make_model(PATD3, LayoutEnv(bits_space(10)), buffer_size=300_000, action_layout="joint")
 
 
 def test_log_prob_of_several_choices():

@@ -217,6 +217,11 @@ def test_masks_of_parts_and_of_joint_actions():
     # Where both forms have the same length, it is that of parts
     spec = HybridActionSpec(spaces.Tuple((spaces.MultiDiscrete([2, 2]), box(0, 1, 1))))
     assert read_masks(spec, np.array([1, 0, 0, 1]), 1).tolist() == [[False, True, False, False]]
+    # A factored space has no place for a mask of joint actions
+    bits = spaces.Tuple((spaces.MultiBinary(7), box(0, 1, 1)))
+    with pytest.raises(ValueError, match=r"14 booleans .* got shape \(128,\); action_layout='joint' takes that"):
+        read_masks(HybridActionSpec(bits), np.ones(128, dtype=bool), 1)
+    assert read_masks(HybridActionSpec(bits, "joint"), np.ones(128, dtype=bool), 1).all()
 
 
 def test_nearest_allowed_row():

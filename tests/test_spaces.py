@@ -109,7 +109,7 @@ def test_integer_boxes_reach_the_limits_of_their_type(dtype):
 @given(radices=st.lists(st.integers(1, 4), min_size=1, max_size=4), seed=st.integers(0, 1000))
 def test_joint_index_is_a_bijection(radices, seed):
     space = spaces.Tuple((spaces.MultiDiscrete(radices), spaces.MultiBinary(2), box(-1, 1, 1)))
-    spec = HybridActionSpec(space)
+    spec = HybridActionSpec(space, "joint")
     assert spec.n_discrete_actions == 4 * np.prod(radices)
     natives = [spec.to_native([k, 0.0]) for k in range(spec.n_discrete_actions)]
     assert len({(tuple(a), tuple(b)) for a, b, _ in natives}) == spec.n_discrete_actions

@@ -37,7 +37,10 @@ def read_masks(spec: HybridActionSpec, masks: Any, n: int, first: int = 0) -> np
     accepted = sorted({spec.n_mask_values, sum(spec.radices)})
     if array.ndim != 2 or len(array) != n or array.shape[1] not in accepted:
         lengths = " or ".join(map(str, accepted))
-        raise ValueError(f"action_masks must be {lengths} booleans for each of {n} environment(s), got shape {given.shape}")
+        hint = "; action_layout='joint' takes that" if array.ndim == 2 and array.shape[1] == spec.n_discrete_actions else ""
+        raise ValueError(
+            f"action_masks must be {lengths} booleans for each of {n} environment(s), got shape {given.shape}{hint}"
+        )
     if array.shape[1] == spec.n_mask_values:
         array = spec.join_masks(array)
     # A value of every choice

@@ -27,8 +27,8 @@ from sb3_chdp.common.space_tree import (
 )
 
 MAX_DISCRETE_ACTIONS = 65_536
-# More joint discrete actions than these are factored unless the layout says otherwise
-FACTORED_ABOVE = 1024
+# More joint discrete actions than these, too many to compare all of them, are factored unless the layout says otherwise
+FACTORED_ABOVE = 64
 LAYOUTS = ("auto", "per_action", "shared", "joint", "factored")
 
 
@@ -43,7 +43,7 @@ class HybridActionSpec:
       ``OneOf((Box_1, ..., Box_K))``. An action without parameters is an empty ``Box``, ``Tuple`` or ``Dict``, or
       ``Discrete(1)``;
     * parameters shared by all actions: ``Tuple(Discrete(K), Box)``, and every product of several ``Discrete``,
-      ``MultiDiscrete`` or ``MultiBinary`` leaves with ``Box`` leaves. Up to 1,024 combinations the discrete leaves form one
+      ``MultiDiscrete`` or ``MultiBinary`` leaves with ``Box`` leaves. Up to 64 combinations the discrete leaves form one
       joint index (mixed radix, first leaf most significant). Beyond that the space is factored: every digit of a leaf is a
       choice of its own, and k has a column for each. ``layout="joint"`` and ``layout="factored"`` override the rule.
 
