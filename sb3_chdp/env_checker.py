@@ -268,7 +268,7 @@ class _Player:
 
     def seed_oddity(self) -> str | None:
         """:return: what is wrong if two runs with one seed differ"""
-        if data_equivalence(self._run(), self._run()):
+        if data_equivalence(self._run(self.spec), self._run(self.spec)):
             return None
         return (
             "Two runs with reset(seed=1) and the same actions differ: call super().reset(seed=seed) and draw random numbers "
@@ -277,9 +277,10 @@ class _Player:
 
     def layout_oddity(self) -> str | None:
         """:return: what is wrong if two runs differ by nothing but parameters of actions that are not chosen"""
-        if self.spec.is_shared or data_equivalence(self._run(others_at=-1), self._run(others_at=1)):
+        if self.spec.is_shared:
             return None
-        if self.seed_oddity() is not None:
+        low, high = (self._run(self.spec.leaving_others_at(place)) for place in (-1, 1))
+        if data_equivalence(low, high) or self.seed_oddity() is not None:
             return None
         return (
             "Parameters of other actions than the chosen one have an effect. If every action has all of them, give the "
@@ -287,20 +288,12 @@ class _Player:
             f"{self.spec.names_of(0)}, action 1 {self.spec.names_of(1)}, and so on; a Dict sorts its keys"
         )
 
-    def _run(self, others_at: int | None = None) -> list[Any]:
-        """
-        :param others_at: -1: parameters of actions that are not chosen are at their lower bounds, 1: at the upper ones; None:
-            in the middle
-        :return: what comes of random actions after ``reset(seed=1)``
-        """
+    def _run(self, spec: HybridActionSpec) -> list[Any]:
+        """:return: what comes of random actions after ``reset(seed=1)``, made native by this codec"""
         rng = np.random.default_rng(1)
         run: list[Any] = [deepcopy(self.reset(seed=1))]
         for _ in range(N_COMPARED):
-            row = self._random_row(rng)
-            action = self.spec.to_native(row)
-            if others_at is not None:
-                action = self.spec.with_others(action, int(row[0]), others_at)
-            answer = self.step(action)
+            answer = self.step(spec.to_native(self._random_row(rng)))
             run.append(deepcopy(answer))
             if answer[2] or answer[3]:
                 break

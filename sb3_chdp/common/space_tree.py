@@ -154,8 +154,8 @@ def collect_boxes(space: spaces.Space[Any], prefix: Path, name: str | None = Non
     return boxes
 
 
-def template_action(space: spaces.Space[Any]) -> Any:
-    """:return: a native action with every box at the middle of its bounds, to be filled in by ``to_native``"""
+def template_action(space: spaces.Space[Any], place: float) -> Any:
+    """:return: a native action with every box at a place from -1, its lower bounds, to 1, to be filled in by ``to_native``"""
     cache: dict[Any, np.ndarray] = {}
 
     def build(part: spaces.Space[Any]) -> Any:
@@ -170,8 +170,8 @@ def template_action(space: spaces.Space[Any]) -> Any:
         # Equal boxes share one array: cheap to hold and, in subprocesses, to pickle
         key = (part.shape, part.dtype, part.low.tobytes(), part.high.tobytes())
         if key not in cache:
-            middle = 0.5 * part.low.astype(np.float64) + 0.5 * part.high.astype(np.float64)
-            cache[key] = cast_to_box(middle, part)
+            low, high = part.low.astype(np.float64), part.high.astype(np.float64)
+            cache[key] = cast_to_box((0.5 - place / 2) * low + (0.5 + place / 2) * high, part)
         return cache[key]
 
     return build(space)

@@ -2,6 +2,7 @@
 
 import pickle
 from collections.abc import Iterator
+from copy import copy
 from functools import cached_property
 from typing import Any
 
@@ -113,14 +114,29 @@ class HybridActionSpec:
         self.radices: tuple[int, ...] = self.digits if self.is_factored else (n_joint,)
         if isinstance(space, spaces.OneOf):
             self._boxes = [collect_boxes(part, path, f"action_space.spaces[{i}]") for i, (path, part) in enumerate(options)]
-            # The part of the native action behind the index lives under the key "option" while it is being built
-            templates: list[Any] = [{"option": template_action(option)} for option in space.spaces]
         else:
             self._boxes = [collect_boxes(part, path) for path, part in options]
-            templates = [template_action(space)]
-        # Pickled: to load one is the fastest way to copy it, and every action has arrays of its own, which may be changed
-        self._templates = [pickle.dumps(template) for template in templates]
+        self._templates = self._make_templates(0.0)
         self._build_tables()
+
+    def _make_templates(self, place: float) -> list[bytes]:
+        if isinstance(self.space, spaces.OneOf):
+            # The part of the native action behind the index lives under the key "option" while it is being built
+            templates: list[Any] = [{"option": template_action(option, place)} for option in self.space.spaces]
+        else:
+            templates = [template_action(self.space, place)]
+        # Pickled: to load one is the fastest way to copy it, and every action has arrays of its own, which may be changed
+        return [pickle.dumps(template) for template in templates]
+
+    def leaving_others_at(self, place: float) -> "HybridActionSpec":
+        """
+        :param place: scaled value in [-1, 1]
+        :return: a codec whose native actions have all parameters there that are not those of the chosen action, instead of in
+            the middle
+        """
+        spec = copy(self)
+        spec._templates = self._make_templates(place)
+        return spec
 
     def _build_tables(self) -> None:
         """Fill the (K, Pmax) tables: which parameters there are, centres, half ranges, columns in the concatenated vector."""
@@ -245,17 +261,6 @@ class HybridActionSpec:
         if isinstance(leaf.space, spaces.Discrete):
             return leaf.space.dtype.type(values[0])
         return values.reshape(leaf.space.shape).astype(leaf.space.dtype)
-
-    def with_others(self, action: Any, k: int, side: int) -> Any:
-        """
-        :param action: a native action
-        :param k: its discrete action
-        :param side: -1 or 1
-        :return: the same with the parameters of all other actions at their lower (-1) or upper (1) bounds
-        """
-        for box in (box for i, boxes in enumerate(self._boxes) if i != k for box in boxes if box.path[0] != "option"):
-            action = replace_part(action, box.path, (box.space.low if side < 0 else box.space.high).copy())
-        return action
 
     def names_of(self, k: int) -> str:
         """:return: the boxes of a discrete action"""
