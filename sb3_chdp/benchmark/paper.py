@@ -102,6 +102,10 @@ def deviations_of(meta: dict[str, Any], table: str) -> list[str]:
     return differences(meta["settings"], settings_of(today))
 
 
+def _steps_of(meta: dict[str, Any]) -> int:
+    return int(float(meta["settings"]["n_timesteps"]))
+
+
 def describe_cells(results: Path, table: str) -> list[Cell]:
     """
     :param results: folder of the published results
@@ -110,16 +114,18 @@ def describe_cells(results: Path, table: str) -> list[Cell]:
     """
     cells: list[Cell] = []
     for folder in sorted({path.parent for path in (results / table).glob("*/*/seed_*.json")}):
-        metas = sorted((read_meta(path) for path in folder.glob("seed_*.json")), key=lambda meta: meta["seed"])
-        cell: Cell = {"environment": metas[0]["env_id"], "algorithm": metas[0]["algo"]}
-        if metas[0]["name"] != metas[0]["algo"]:
-            cell["variant"] = metas[0]["name"]
-        cell["steps"] = int(float(metas[0]["settings"]["n_timesteps"]))
-        if metas[0]["eval_freq"] is not None:
-            cell["eval_freq"] = metas[0]["eval_freq"]
-        cell["seeds"] = {meta["seed"]: meta["commit"][:COMMIT_DIGITS] for meta in metas}
-        deviations = sorted({name for meta in metas for name in deviations_of(meta, table)})
-        if deviations:
-            cell["deviations"] = deviations
-        cells.append(cell)
+        of_folder = sorted((read_meta(path) for path in folder.glob("seed_*.json")), key=lambda meta: meta["seed"])
+        for steps in sorted({_steps_of(meta) for meta in of_folder}):
+            metas = [meta for meta in of_folder if _steps_of(meta) == steps]
+            cell: Cell = {"environment": metas[0]["env_id"], "algorithm": metas[0]["algo"]}
+            if metas[0]["name"] != metas[0]["algo"]:
+                cell["variant"] = metas[0]["name"]
+            cell["steps"] = steps
+            if metas[0]["eval_freq"] is not None:
+                cell["eval_freq"] = metas[0]["eval_freq"]
+            cell["seeds"] = {meta["seed"]: meta["commit"][:COMMIT_DIGITS] for meta in metas}
+            deviations = sorted({name for meta in metas for name in deviations_of(meta, table)})
+            if deviations:
+                cell["deviations"] = deviations
+            cells.append(cell)
     return cells
