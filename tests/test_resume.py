@@ -217,7 +217,7 @@ def test_hindsight(tmp_path):
 
     outcomes = []
     for parts in ([80], [40, 40]):
-        # What follows depends on the end of a training otherwise
+        # A rate that falls would depend on where the training ends
         settings: dict[str, Any] = dict(exploration_initial_eps=0.2, exploration_final_eps=0.2)
         settings.update(replay_buffer_class=HerReplayBuffer, buffer_size=60, learning_starts=20)
         model: Any = make_model(PATD3, make_env(2, env_class=GoalWalkEnv), "MultiInputPolicy", **settings)
