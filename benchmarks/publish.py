@@ -51,16 +51,24 @@ def paper_column(row: str, env: str) -> str:
     return dict(zip(VARIANTS, PAPER_ABLATION[env], strict=True))[row]
 
 
-def overview(scores: pd.DataFrame, rows: list[str], envs: list[str]) -> str:
-    """:return: a line per environment: mean score of the first algorithm and of the best other one, and the paper's figure"""
-    first, *others = rows
+def overview(scores: pd.DataFrame, rows: list[str], envs: list[str], today: pd.DataFrame) -> str:
+    """
+    :param scores: those of version 0.1.0
+    :param rows: algorithms, CHDP first
+    :param envs: environments
+    :param today: scores of CHDP with its one setting
+    :return: a line per environment: mean scores of CHDP, today and then, and of the best baseline, and the paper's figure
+    """
+    chdp, *baselines = rows
     means = scores.groupby(["env", "row"])["score"].mean()
     lines = []
     for env in envs:
-        best = max((row for row in others if (env, row) in means), key=lambda row: means[env, row])
-        published = paper.paper_column(first, env).split()
-        lines.append([env, f"{means[env, first]:.1f}", f"{means[env, best]:.1f} ({display_name(best)})", *published[:1]])
-    return tables.markdown(["environment", display_name(first), "best baseline", f"{display_name(first)} in the paper"], lines)
+        of_today = today.loc[today["env"] == env, "score"]
+        best = max((row for row in baselines if (env, row) in means), key=lambda row: means[env, row])
+        published = paper.paper_column(chdp, env).split()[0]
+        cells = f"{of_today.mean():.1f}", len(of_today), f"{means[env, chdp]:.1f}", f"{means[env, best]:.1f} ({display_name(best)})"
+        lines.append([env, *map(str, cells), published])
+    return tables.markdown(["environment", "CHDP", "seeds", "CHDP 0.1.0", "best baseline", "CHDP in the paper"], lines)
 
 
 def one_setting(cells: list[paper.Cell], scores: pd.DataFrame) -> str:
@@ -79,7 +87,8 @@ def main() -> None:
     parser.add_argument("--print", action="store_true", dest="only_print")
     args = parser.parse_args()
     protocol = {table: paper.describe_cells(RESULTS, table) for table in (MAIN, ONE_SETTING, *TABLES)}
-    today = one_setting(yaml_order(protocol[ONE_SETTING]), scores_of(read_results(RESULTS / ONE_SETTING)))
+    scores_today = scores_of(read_results(RESULTS / ONE_SETTING))
+    today = one_setting(yaml_order(protocol[ONE_SETTING]), scores_today)
     results = read_results(RESULTS / MAIN)
     scores = scores_of(results)
     envs = tables.order(scores["env"], [cell["environment"] for cell in yaml_order(protocol[MAIN])])
@@ -98,7 +107,7 @@ def main() -> None:
     paper.PROTOCOL.write_text(PROTOCOL_HEADER + yaml.safe_dump(protocol, sort_keys=False, width=127))
     replace_section(README, "tables", text)
     replace_section(TUNING, "one setting", today)
-    replace_section(ROOT.parent / "README.md", "tables", overview(scores, rows, envs))
+    replace_section(ROOT.parent / "README.md", "tables", overview(scores, rows, envs, scores_today))
     for x, name in (("timesteps", "curves.png"), ("minutes", "curves_minutes.png")):
         figures.plot_curves(results, scores, rows, envs, x, FIGURES / name)
     figures.plot_scores(scores, rows, envs, FIGURES / "scores.png", paper.paper_mean)

@@ -44,7 +44,7 @@ def check_hybrid_env(env: gym.Env, action_layout: str = "auto", warn: bool = Tru
     :param warn: whether to warn about legal but unusual things
     :param skip_render_check: whether to skip the checks of the render method
     :raises ValueError: if the action space is not a hybrid one, or SB3's policies cannot read the observations
-    :raises AssertionError: if the environment breaks the API; the message says what to mend
+    :raises AssertionError: if the environment breaks the API; the message says what to fix
     """
     _check_is_env(env)
     spec = HybridActionSpec(env.action_space, action_layout)

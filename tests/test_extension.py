@@ -1,4 +1,4 @@
-"""An algorithm is a folder and one line, an environment a file and one registration: docs/guide, word for word."""
+"""An algorithm is a folder and one line, an environment a file: docs/guide, word for word."""
 
 import os
 import re
@@ -70,12 +70,11 @@ def test_new_algorithm(tmp_path):
 
 
 @pytest.mark.slow
-def test_new_env(tmp_path):
-    """In a folder of its own, with the file of the guide; the environment reports no success."""
-    (code,) = blocks("new_env.md", "python")
-    (tmp_path / "valve_envs.py").write_text(code)
-    train, benchmark = commands("new_env.md")
+def test_own_environment(tmp_path):
+    """In a folder of its own, with the file of the guide."""
+    (tmp_path / "mine.py").write_text(blocks("own_environment.md", "python")[0])
+    train, *_, benchmark = commands("own_environment.md")[:6]
     run(*train[1:], *QUICK["train"], cwd=tmp_path)
-    assert (tmp_path / "logs" / "pdqn_td3" / "Tank-v0_1" / "Tank-v0.zip").is_file()
-    assert "| Tank-v0 | PDQN-TD3 | return |" in run(*benchmark[1:], *QUICK["benchmark"], cwd=tmp_path)
-    check_report(tmp_path / "logs" / "benchmark", "PDQN-TD3", "PA-TD3")
+    assert (tmp_path / "logs" / "chdp" / "Own-v0_1" / "Own-v0.zip").is_file()
+    assert "| Own-v0 | CHDP |" in run(*benchmark[1:], *QUICK["benchmark"], cwd=tmp_path)
+    check_report(tmp_path / "logs" / "benchmark", "PDQN-TD3", "SB3's SAC")

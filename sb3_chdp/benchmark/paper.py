@@ -57,11 +57,10 @@ def paper_mean(row: str, env: str) -> float | None:
 
 def deviation_column(cells: list[Cell]) -> Callable[[str, str], str]:
     """:return: a column that marks the cells whose settings are not those of today"""
-    deviations = {(cell.get("variant", cell["algorithm"]), cell["environment"]): cell.get("deviations") for cell in cells}
+    deviate = {(cell.get("variant", cell["algorithm"]), cell["environment"]) for cell in cells if "deviations" in cell}
 
     def column(row: str, env: str) -> str:
-        changed = deviations.get((row, env))
-        return f"other than today: {', '.join(changed)}" if changed else "today's"
+        return "others" if (row, env) in deviate else "today's"
 
     return column
 
@@ -106,6 +105,11 @@ def _steps_of(meta: dict[str, Any]) -> int:
     return int(float(meta["settings"]["n_timesteps"]))
 
 
+def _short(commit: str) -> str:
+    digits, *dirty = commit.split("-")  # "-dirty" behind it: with uncommitted changes
+    return "-".join([digits[:COMMIT_DIGITS], *dirty])
+
+
 def describe_cells(results: Path, table: str) -> list[Cell]:
     """
     :param results: folder of the published results
@@ -123,7 +127,7 @@ def describe_cells(results: Path, table: str) -> list[Cell]:
             cell["steps"] = steps
             if metas[0]["eval_freq"] is not None:
                 cell["eval_freq"] = metas[0]["eval_freq"]
-            cell["seeds"] = {meta["seed"]: meta["commit"][:COMMIT_DIGITS] for meta in metas}
+            cell["seeds"] = {meta["seed"]: _short(meta["commit"]) for meta in metas}
             deviations = sorted({name for meta in metas for name in deviations_of(meta, table)})
             if deviations:
                 cell["deviations"] = deviations

@@ -63,7 +63,7 @@ class GoalEnv(HybridEnv):
     | k | action | parameters | range | lasts |
     |---|---|---|---|---|
     | 0 | kick-to | x and y of the place to kick to | 0 to 40, -15 to 15 | until the ball rests at the player |
-    | 1, 2 | shoot, twice the same | y at which the ball shall cross the goal line | -7.01 to 7.01 | until the episode ends |
+    | 1, 2 | shoot, twice the same | y at which the ball is to cross the goal line | -7.01 to 7.01 | until the episode ends |
 
     As in the original, kick-to takes its first parameter for y too, and the second has no effect. Parameters out of range are
     clipped.

@@ -22,7 +22,7 @@ Point = tuple[float, float]
 
 def checked_point(name: str, value: Any) -> Point:
     """
-    :param name: what the error shall call it
+    :param name: what the error calls it
     :param value: what the user gave
     :return: two coordinates
     :raises ValueError: if they are not two finite numbers
