@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pandas as pd
 import yaml
+from protocol import describe_cells, deviation_column
 
 from sb3_chdp.benchmark import figures, paper, tables
 from sb3_chdp.benchmark.paper import MAIN
@@ -66,7 +67,12 @@ def overview(scores: pd.DataFrame, rows: list[str], envs: list[str], today: pd.D
         of_today = today.loc[today["env"] == env, "score"]
         best = max((row for row in baselines if (env, row) in means), key=lambda row: means[env, row])
         published = paper.paper_column(chdp, env).split()[0]
-        cells = f"{of_today.mean():.1f}", len(of_today), f"{means[env, chdp]:.1f}", f"{means[env, best]:.1f} ({display_name(best)})"
+        cells = (
+            f"{of_today.mean():.1f}",
+            len(of_today),
+            f"{means[env, chdp]:.1f}",
+            f"{means[env, best]:.1f} ({display_name(best)})",
+        )
         lines.append([env, *map(str, cells), published])
     return tables.markdown(["environment", "CHDP", "seeds", "CHDP 0.1.0", "best baseline", "CHDP in the paper"], lines)
 
@@ -86,19 +92,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--print", action="store_true", dest="only_print")
     args = parser.parse_args()
-    protocol = {table: paper.describe_cells(RESULTS, table) for table in (MAIN, ONE_SETTING, *TABLES)}
+    protocol = {table: describe_cells(RESULTS, table) for table in (MAIN, ONE_SETTING, *TABLES)}
     scores_today = scores_of(read_results(RESULTS / ONE_SETTING))
     today = one_setting(yaml_order(protocol[ONE_SETTING]), scores_today)
     results = read_results(RESULTS / MAIN)
     scores = scores_of(results)
     envs = tables.order(scores["env"], [cell["environment"] for cell in yaml_order(protocol[MAIN])])
     rows = tables.order(scores["row"], list(ALGORITHMS))
-    columns = {"paper": paper.paper_column, "settings": paper.deviation_column(protocol[MAIN])}
+    columns = {"paper": paper.paper_column, "settings": deviation_column(protocol[MAIN])}
     parts = [tables.report(scores, rows, envs, columns)]
     for table, title in TABLES.items():
         ablation = scores_of(read_results(RESULTS / table))
         variants = tables.order(ablation["row"], list(VARIANTS))
-        columns = {"paper": paper_column, "settings": paper.deviation_column(protocol[table])}
+        columns = {"paper": paper_column, "settings": deviation_column(protocol[table])}
         parts += [f"### {title}", tables.score_table(ablation, variants, tables.order(ablation["env"], []), columns)]
     text = "\n\n".join(parts)
     print(text, today, sep="\n\n")

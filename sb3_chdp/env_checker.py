@@ -53,7 +53,9 @@ def check_hybrid_env(env: gym.Env, action_layout: str = "auto", warn: bool = Tru
     player.play_extremes()
     player.play_episodes()
     if warn:
-        for sentence in [*player.oddities(), player.seed_oddity(), player.layout_oddity() or _unusual_space(spec)]:
+        of_seed = player.seed_oddity()
+        of_layout = player.layout_oddity() if of_seed is None else None
+        for sentence in [*player.oddities(), of_seed, of_layout or _unusual_space(spec)]:
             if sentence is not None:
                 warnings.warn(sentence, stacklevel=2)
     flat = FlattenHybridAction(env, action_layout)
@@ -276,11 +278,11 @@ class _Player:
         )
 
     def layout_oddity(self) -> str | None:
-        """:return: what is wrong if two runs differ by nothing but parameters of actions that are not chosen"""
+        """:return: what is wrong if two runs that differ by nothing but parameters of actions that are not chosen differ"""
         if self.spec.is_shared:
             return None
         low, high = (self._run(self.spec.leaving_others_at(place)) for place in (-1, 1))
-        if data_equivalence(low, high) or self.seed_oddity() is not None:
+        if data_equivalence(low, high):
             return None
         return (
             "Parameters of other actions than the chosen one have an effect. If every action has all of them, give the "

@@ -24,8 +24,9 @@ from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.registry import ALGORITHMS
 from sb3_chdp.zoo_arguments import ArgumentsError
 
-# Of a random episode, at whose end some environments say whether it was a success
+# Of random play, at the ends of whose episodes some environments say whether it was a success
 EXAMPLE_STEPS = 1000
+EXAMPLE_EPISODES = 3
 FLATTEN = "sb3_chdp.wrappers.FlattenHybridAction"
 TRANSPOSE = "stable_baselines3.common.vec_env.VecTransposeImage"
 
@@ -86,12 +87,16 @@ class HybridExperimentManager(ExperimentManager):
         for settings in (hyperparams, saved):
             settings.setdefault("policy", "MlpPolicy")
             settings.setdefault("n_timesteps", self.n_timesteps)
+        for name, value in hyperparams.items():
+            if isinstance(value, str) and _is_number(value):
+                raise ArgumentsError(f"{name}: YAML reads {value} as a text, write !!float {value}")
         if hyperparams["n_timesteps"] <= 0:
             raise ArgumentsError(f"-n says for how many steps: the file {self.config} does not")
         if hyperparams.get("env_kwargs") and not self.env_kwargs:
             # Those of the YAML file are for evaluation too
             self.env_kwargs = hyperparams["env_kwargs"]
             self.eval_env_kwargs = self._eval_env_kwargs_args or self.env_kwargs
+        self._layout: str = hyperparams.get("action_layout", "auto")
         if self.algo not in ALGORITHMS and isinstance(self._example[0], HYBRID_SPACES):
             for settings in (hyperparams, saved):
                 _flatten(settings)
@@ -140,27 +145,37 @@ class HybridExperimentManager(ExperimentManager):
         return super()._preprocess_action_noise(hyperparams, saved_hyperparams, env)
 
     @cached_property
-    def _example(self) -> tuple[gym.Space[Any], dict[str, Any]]:
-        """:return: action space of the environment, and what the infos of an episode hold"""
+    def _example(self) -> tuple[gym.Space[Any], set[str]]:
+        """:return: action space of the environment, and what the last info of every episode has"""
         env = gym.make(self.env_name.gym_id, **self.env_kwargs)
-        env.reset(seed=0)
-        infos: dict[str, Any] = {}
+        spec = HybridActionSpec(env.action_space, self._layout) if isinstance(env.action_space, HYBRID_SPACES) else None
         rng = np.random.default_rng(0)
+        ends: list[set[str]] = []
+        env.reset(seed=0)
         for _ in range(EXAMPLE_STEPS):
-            *_, terminated, truncated, info = env.step(random_action(env, rng))
-            infos |= info
+            *_, terminated, truncated, info = env.step(random_action(env, spec, rng))
             if terminated or truncated:
-                break
+                ends.append(set(info))
+                if len(ends) == EXAMPLE_EPISODES:
+                    break
+                env.reset()
         env.close()
-        return env.action_space, infos
+        return env.action_space, set.intersection(*ends) if ends else set(info)
 
 
-def random_action(env: gym.Env, rng: np.random.Generator) -> Any:
-    """:return: an action that the masks of the environment, if it has any, allow"""
-    if not isinstance(env.action_space, HYBRID_SPACES):
+def random_action(env: gym.Env, spec: HybridActionSpec | None, rng: np.random.Generator) -> Any:
+    """:return: an action that the masks of the environment, if it has any, allow; without a spec any"""
+    if spec is None:
         return env.action_space.sample()
-    spec = HybridActionSpec(env.action_space)
     return spec.to_native(spec.sample_rows(rng, 1, allowed_now(env, spec))[0])
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _normalizable(space: gym.Space[Any]) -> dict[str, Any]:

@@ -198,6 +198,15 @@ def test_replay_buffers_of_other_models(off_policy_algorithm, name, trusted, tmp
     model.learn(20, reset_num_timesteps=False)
 
 
+def test_n_step_buffers_discount_as_the_algorithm_does(off_policy_algorithm):
+    model = make_model(off_policy_algorithm, make_layout_env(), gamma=0.5, replay_buffer_class=NStepReplayBuffer)
+    assert isinstance(model.replay_buffer, NStepReplayBuffer) and model.replay_buffer.gamma == 0.5
+    kwargs = dict(replay_buffer_class=NStepReplayBuffer, replay_buffer_kwargs=dict(gamma=0.7))
+    assert make_model(off_policy_algorithm, make_layout_env(), **kwargs).replay_buffer.gamma == 0.7
+    with pytest.raises(ValueError, match="replay_buffer_kwargs must be a dict, or None, got 5"):
+        make_model(off_policy_algorithm, make_layout_env(), replay_buffer_kwargs=5)
+
+
 def test_replay_buffers_of_other_returns(off_policy_algorithm, tmp_path):
     make_model(off_policy_algorithm, make_layout_env(), n_steps=3).save_replay_buffer(tmp_path / "buffer")
     model = make_model(off_policy_algorithm, make_layout_env(), n_steps=2)

@@ -1,6 +1,7 @@
 """Scores, tables and figures of any grid of algorithms and environments, and the published ones."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,17 @@ import pytest
 import yaml
 
 pytest.importorskip("rliable")
+pytest.importorskip("rl_zoo3")
 
 from sb3_chdp import ALGORITHMS
 from sb3_chdp.benchmark import figures, paper, tables
 from sb3_chdp.benchmark.results import FIELDS, ResultsError, differences, read_results
 from sb3_chdp.benchmark.runs import display_name, file_name
 from sb3_chdp.benchmark.statistics import iqm, matrix_of, probability_of_improvement, scores_of
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+
+import protocol
 
 BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 RESULTS = BENCHMARKS / "results"
@@ -149,7 +155,7 @@ def test_protocol_tells_what_was_run(table):
     """Every published file is named, with its seed, steps and commit, and settings that are not today's are marked."""
     pytest.importorskip("rl_zoo3")
     named = paper.load_protocol()[table]
-    assert named == paper.describe_cells(RESULTS, table), "python benchmarks/publish.py writes it anew"
+    assert named == protocol.describe_cells(RESULTS, table), "python benchmarks/publish.py writes it anew"
     runs = {
         (cell.get("variant", cell["algorithm"]), file_name(cell["environment"]), seed)
         for cell in named
@@ -176,11 +182,11 @@ def test_documents_show_what_was_measured():
 def test_deviations_are_found_and_marked():
     path = next((RESULTS / "main" / "hppo" / "Goal-v0").glob("*.json"))
     meta = json.loads(path.read_text())
-    assert paper.deviations_of(meta, "main") == []
+    assert protocol.deviations_of(meta, "main") == []
     meta["settings"]["gamma"] = "0.5"
-    assert paper.deviations_of(meta, "main") == ["gamma"]
+    assert protocol.deviations_of(meta, "main") == ["gamma"]
     cells = [{"environment": "Goal-v0", "algorithm": "hppo", "deviations": ["gamma"]}]
-    assert paper.deviation_column(cells)("hppo", "Goal-v0") == "others"
+    assert protocol.deviation_column(cells)("hppo", "Goal-v0") == "others"
 
 
 def test_paper_command_trains_every_published_run():

@@ -90,9 +90,7 @@ def test_predictions(algorithm, tmp_path):
         model.predict(obs, action_masks=masks[:, :2])
     model.save(tmp_path / "model")
     loaded = algorithm.load(tmp_path / "model", env=env)
-    assert loaded.use_masking
-    with pytest.raises(ValueError, match="use_masking must be True or False, got None"):
-        algorithm.load(tmp_path / "model", env=env, use_masking=None)
+    assert loaded.use_masking and algorithm.load(tmp_path / "model", env=env, use_masking=None).use_masking
     loaded.learn(60)
 
 
@@ -143,6 +141,19 @@ def test_trained_with_masks_and_then_without(tmp_path):
     env = LayoutEnv(layouts()["nested"], MaskedEnv().observation_space)
     loaded = PATD3.load(tmp_path / "model", env=env, use_masking=False).learn(40)
     assert isinstance(loaded.replay_buffer, NStepReplayBuffer) and loaded.replay_buffer.n_steps == 3
+
+
+@pytest.mark.parametrize("algorithm", CLASSES)
+def test_made_without_masks_and_then_with(algorithm, tmp_path):
+    free = LayoutEnv(layouts()["nested"], MaskedEnv().observation_space)
+    model = make_model(algorithm, free)
+    model.save(tmp_path / "model")
+    assert algorithm.load(tmp_path / "model", env=MaskedEnv()).use_masking
+    model.set_env(free)
+    model.learn(10)
+    model.set_env(MaskedEnv())
+    with pytest.warns(UserWarning, match=r"has action_masks\(\), .* forbidden actions are taken"), pytest.raises(ValueError):
+        model.learn(60)
 
 
 def test_n_step_returns_of_dict_observations_are_refused():
@@ -283,7 +294,7 @@ def test_rl_zoo3_looks_at_an_allowed_action():
     for seed in range(20):
         env = MaskedEnv()
         env.reset(seed=seed)
-        env.step(zoo.random_action(env, np.random.default_rng(0)))
+        env.step(zoo.random_action(env, HybridActionSpec(env.action_space), np.random.default_rng(0)))
 
 
 def test_rl_zoo3_evaluates_with_masks(monkeypatch):

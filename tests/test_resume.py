@@ -27,7 +27,7 @@ from sb3_chdp.common.buffers import PrioritizedDictReplayBuffer
 from sb3_chdp.common.resume import ResumableCheckpoint, resume
 from tests import resume_runs
 from tests.algorithms import make_model
-from tests.resume_runs import RUNS, WalkEnv, generations, make_env, trained
+from tests.resume_runs import RUNS, ResumableWalkEnv, WalkEnv, generations, make_env, trained
 
 # How often the crash test crashes
 N_CRASHES = int(os.environ.get("N_CRASHES", "4"))
@@ -143,6 +143,31 @@ def test_environments_in_other_processes(tmp_path):
         runs.append((model.replay_buffer.observations, [e["r"] for e in model.ep_info_buffer]))
     np.testing.assert_array_equal(runs[0][0], runs[1][0])
     assert runs[0][1] == runs[1][1]
+
+
+def test_generators_of_the_old_kind_in_other_processes(tmp_path):
+    class OldWalkEnv(ResumableWalkEnv):
+        old = np.random.RandomState(0)
+        np_random = property(lambda self: self.old, lambda self, value: None)
+
+        def get_state(self):
+            return {"x": self.x}
+
+    env = make_env(1, env_class=OldWalkEnv, vec_env_class=SubprocVecEnv)
+    make_model(PATD3, env).learn(20, ResumableCheckpoint(10, tmp_path))
+    env.close()
+
+
+def test_replay_buffers_of_another_size(tmp_path):
+    """What was never written is never replayed."""
+    small = make_model(PATD3, make_env(1), buffer_size=20).learn(30)
+    small.save_replay_buffer(tmp_path / "buffer")
+    model = make_model(PATD3, make_env(1))
+    model.load_replay_buffer(tmp_path / "buffer")
+    model.learn(30, ResumableCheckpoint(10, tmp_path / "run"), reset_num_timesteps=False)
+    with pytest.raises(ValueError, match="buffer_size must be 20 like the checkpoint, got 500"):
+        resume(tmp_path / "run", make_env(1), buffer_size=500)
+    assert resume(tmp_path / "run", make_env(1)).replay_buffer.size() == 20
 
 
 def test_wrong_use(tmp_path):

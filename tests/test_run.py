@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
     VecTransposeImage,
 )
+from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_chdp import CHDP, HPPO, PATD3, FlattenHybridAction, HyARTD3, check_hybrid_env
 from tests.algorithms import LAYOUTS, OFF_POLICY_ALGORITHMS, has_learnt, make_model, snapshot
@@ -279,6 +280,9 @@ def test_policies_that_do_not_fit(algorithm):
         make_model(algorithm, make_layout_env(), "MlpPolcy")
     with pytest.raises(ValueError, match=r"policy must be 'MlpPolicy', or 'CnnPolicy' for images, .*got \w*MultiInputPolicy"):
         make_model(algorithm, make_layout_env(), "MultiInputPolicy")
+    for policy in (5, TD3Policy):
+        with pytest.raises(ValueError, match=r"policy must be one of \('MlpPolicy', .*\) or derived from one, got (5|<class)"):
+            make_model(algorithm, make_layout_env(), policy)
     with pytest.raises(ValueError, match=r"policy_kwargs\['activation_fn'\] must be a class, got 'relu'"):
         make_model(algorithm, make_layout_env(), policy_kwargs=dict(activation_fn="relu"))
     with pytest.raises(ValueError, match=r"policy_kwargs must be a dict, or None, got \[1\]"):
@@ -301,14 +305,21 @@ def test_a_training_without_a_gradient_step_says_so(off_policy_algorithm):
         make_model(off_policy_algorithm, make_layout_env()).learn(10)
 
 
-def test_normalization_around_transposed_images(off_policy_algorithm):
+def test_no_gradient_steps(off_policy_algorithm):
+    with pytest.warns(UserWarning, match="Nothing is learnt yet: no update was due, and training ended after 20"):
+        make_model(off_policy_algorithm, make_layout_env(), gradient_steps=0).learn(20)
+
+
+def test_normalization_within_what_reshapes_observations(off_policy_algorithm):
     class Camera(LayoutEnv):
         def __init__(self):
             super().__init__(layouts()["shared"], spaces.Box(0, 255, (36, 36, 1), np.uint8))
 
     env = DummyVecEnv([Camera])
-    with pytest.raises(ValueError, match=r"env must be VecNormalize\(VecTransposeImage\(env\)\)"):
+    with pytest.raises(ValueError, match=r"as VecNormalize\(VecTransposeImage\(env\)\) has, .* got shapes \(36, 36, 1\)"):
         make_model(off_policy_algorithm, VecNormalize(env, norm_obs=False), "CnnPolicy").learn(20)
+    with pytest.raises(ValueError, match=r"got shapes \(2,\) in VecNormalize and \(4,\) around it"):
+        make_model(off_policy_algorithm, VecFrameStack(VecNormalize(DummyVecEnv([make_layout_env])), 2)).learn(20)
     make_model(off_policy_algorithm, VecNormalize(VecTransposeImage(env), norm_obs=False), "CnnPolicy").learn(20)
 
 

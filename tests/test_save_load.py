@@ -12,11 +12,12 @@ from stable_baselines3 import TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.her import HerReplayBuffer
 
 from sb3_chdp import FlattenHybridAction
 from sb3_chdp.common.td3 import HybridTD3
 from tests.algorithms import LAYOUTS, make_model
-from tests.hybrid_envs import make_layout_env
+from tests.hybrid_envs import GoalEnv, make_layout_env
 
 OBS = np.random.default_rng(0).uniform(-1, 1, (20, 2)).astype(np.float32)
 
@@ -104,6 +105,20 @@ def test_set_env(algorithm):
     model.learn(20)
     with pytest.raises(ValueError, match="Action spaces do not match"):
         model.set_env(make_layout_env("flat"))
+
+
+def test_hindsight_asks_the_new_environment(off_policy_algorithm):
+    class OtherGoalEnv(GoalEnv):
+        n_asked = 0
+
+        def compute_reward(self, achieved_goal, desired_goal, info):
+            OtherGoalEnv.n_asked += len(np.atleast_2d(achieved_goal))
+            return super().compute_reward(achieved_goal, desired_goal, info)
+
+    model = make_model(off_policy_algorithm, GoalEnv(), "MultiInputPolicy", replay_buffer_class=HerReplayBuffer).learn(25)
+    model.set_env(OtherGoalEnv())
+    model.learn(25)
+    assert OtherGoalEnv.n_asked > 25, "not of its own steps alone"
 
 
 def test_vec_normalize_statistics(algorithm, tmp_path):

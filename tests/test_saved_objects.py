@@ -2,6 +2,8 @@
 
 import io
 import json
+import subprocess
+import sys
 from collections import OrderedDict
 
 import numpy as np
@@ -18,6 +20,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_chdp import CHDP, HPPO, PATD3, PaperCHDP
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.buffers import PrioritizedDictReplayBuffer, PrioritizedReplayBuffer
+from sb3_chdp.common.normalization import NormalizedExtractor
 from sb3_chdp.common.serialization import decode, encode
 from tests.algorithms import make_model
 from tests.hybrid_envs import GoalEnv, make_layout_env
@@ -85,6 +88,21 @@ def test_action_noise(noise, n_envs, tmp_path):
         values.append([each.action_noise() for _ in range(3)])
     np.testing.assert_array_equal(values[0], values[1])
     loaded.learn(20)
+
+
+def test_action_noise_of_another_number_of_environments(tmp_path):
+    noise = NormalActionNoise(np.zeros(2), np.full(2, 0.1))
+    make_model(CHDP, make_vec_env(make_layout_env, 2), action_noise=noise).learn(25).save(tmp_path / "model")
+    for n_envs in (1, 3):
+        CHDP.load(tmp_path / "model", env=make_vec_env(make_layout_env, n_envs)).learn(20)
+
+
+@pytest.mark.parametrize("algorithm", [HPPO, PATD3])
+def test_classes_that_nothing_has_imported(algorithm, tmp_path):
+    kwargs = dict(features_extractor_class=NormalizedExtractor)
+    make_model(algorithm, make_layout_env(), policy_kwargs=kwargs).save(tmp_path / "model")
+    code = f"from sb3_chdp import {algorithm.__name__}; {algorithm.__name__}.load({str(tmp_path / 'model')!r})"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 class MyExtractor(FlattenExtractor):

@@ -196,6 +196,14 @@ def test_row_out_of_range():
         HybridActionSpec(layouts()["shared"]).to_native([3, 0, 0])
 
 
+@pytest.mark.parametrize(
+    "layout, action", [("shared", (3, np.zeros(2, np.float32))), ("one_of", (-1, np.zeros(1, np.float32))), ("product", None)]
+)
+def test_actions_that_are_not_in_the_space(layout, action):
+    with pytest.raises(ValueError, match=r"action must be in .*, got"):
+        HybridActionSpec(layouts()[layout]).to_row(action)
+
+
 def test_rows_that_are_no_actions():
     spec = HybridActionSpec(layouts()["shared"])
     with pytest.raises(ValueError, match=r"3 numbers or more, got shape \(2,\)"):

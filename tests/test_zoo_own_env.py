@@ -74,6 +74,31 @@ def test_settings_that_say_little(tmp_path):
     assert run(*arguments, cwd=tmp_path, code=1).endswith("-n says for how many steps: the file mine.yml does not\n")
 
 
+def test_numbers_that_are_text_to_yaml(tmp_path):
+    (tmp_path / "mine.py").write_text(OWN_ENV)
+    (tmp_path / "mine.yml").write_text("Own-v0: {n_steps: 5, batch_size: 10, n_timesteps: 1e2}")
+    arguments = ["train", "--algo", "hppo", "--env", "Own-v0", "--gym-packages", "mine", "-conf", "mine.yml"]
+    message = run(*arguments, cwd=tmp_path, code=1)
+    assert message.endswith("n_timesteps: YAML reads 1e2 as a text, write !!float 1e2\n")
+
+
+def test_success_that_only_some_infos_have(tmp_path):
+    """The monitor insists on what it is told to note."""
+    own_env = OWN_ENV.replace("False, False, {}", 'False, False, {"is_success": True} if action[0] else {}')
+    (tmp_path / "mine.py").write_text(own_env)
+    run("train", "--algo", "hppo", "--env", "Own-v0", "--gym-packages", "mine", "-n", "100", "--eval-freq", "-1",
+        "-params", "n_steps:5", "batch_size:10", cwd=tmp_path)  # fmt: skip
+
+
+def test_masks_of_joint_actions(tmp_path):
+    own_env = OWN_ENV.replace("Tuple((Discrete(2), Box(-1, 1, (1,))))", "Tuple((MultiBinary(7), Box(-1, 1, (1,))))")
+    own_env = own_env.replace("import Box, Discrete", "import Box, Discrete, MultiBinary")
+    mask = "    def action_masks(self):\n        return np.arange(128) % 2 == 0\n\n    def render"
+    (tmp_path / "mine.py").write_text(own_env.replace("    def render", mask))
+    run("train", "--algo", "hppo", "--env", "Own-v0", "--gym-packages", "mine", "-n", "20", "--eval-freq", "-1",
+        "-params", "n_steps:5", "batch_size:10", "action_layout:'joint'", cwd=tmp_path)  # fmt: skip
+
+
 def test_observations_that_cannot_be_normalized(tmp_path):
     (tmp_path / "mine.py").write_text(
         OWN_ENV.replace("observation_space = Box(-1, 1, (2,))", "observation_space = Discrete(3)").replace(

@@ -28,7 +28,7 @@ from sb3_chdp.benchmark.results import ResultsError, read_results
 from sb3_chdp.benchmark.runs import Run
 from sb3_chdp.benchmark.statistics import scores_of
 from sb3_chdp.registry import ALGORITHMS
-from sb3_chdp.zoo_arguments import STOCK, check_hyperparams, import_packages, unknown
+from sb3_chdp.zoo_arguments import STOCK, ArgumentsError, check_hyperparams, import_packages, unknown
 
 SLURM = "--slurm-"
 
@@ -51,7 +51,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--jobs", type=int, help="runs at a time (default: 1, with Slurm as many as it allows)")
     add("-params", "--hyperparams", nargs="+", action=StoreDict, default={}, help="override hyperparameters, as in train")
     add("--conf-folder", help="folder with YAML files of your own, <algorithm>.yml, for the algorithms that have one there")
-    add("--eval-episodes", type=int, default=20, help="episodes of each of the 30 evaluations of a run (default: 20)")
+    add("--eval-episodes", type=int, help="episodes of each of the 30 evaluations of a run (default: 20, of the paper's 100)")
     add("--checkpoint-interval", type=float, default=180, metavar="SECONDS", help="between two checkpoints (default: 180)")
     add("--restart", action="store_true", help="train anew the runs that were started with other settings")
     add("--cluster", choices=jobs.CLUSTERS, default="local", help="processes of this machine, or jobs of Slurm")
@@ -81,7 +81,7 @@ def parse(arguments: list[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
         parser.error(f"{SLURM}... needs --cluster slurm")
     if args.what == "run" and not (args.envs and args.algos):
         parser.error("--envs and --algos say what to compare")
-    if (args.jobs or 1) < 1 or args.eval_episodes < 1:
+    if (args.jobs or 1) < 1 or (args.eval_episodes or 1) < 1:
         parser.error("--jobs and --eval-episodes must be at least 1")
     if args.conf_folder is not None and not list(Path(args.conf_folder).glob("*.yml")):
         parser.error(f"--conf-folder: there is no YAML file in {args.conf_folder}")
@@ -115,15 +115,18 @@ def make_runs(args: argparse.Namespace) -> list[Run]:
     )
     steps = {} if args.steps is None else {"n_timesteps": args.steps}
     overrides = {**args.hyperparams, **steps}
+    evaluation: dict[str, Any] = {} if args.eval_episodes is None else {"eval_episodes": args.eval_episodes}
     if args.what == "paper":
         runs = paper.published_runs(str(args.out), **common)
         wanted = ((args.envs, "env_id"), (args.algos, "algo"), (args.seeds, "seed"))
         runs = [run for run in runs if all(not chosen or getattr(run, key) in chosen for chosen, key in wanted)]
+        if not runs:
+            raise ArgumentsError("no run of the published table has such an environment, algorithm and seed, see protocol.yml")
         # A shorter training may end before the first of the published evaluations
-        changes: dict[str, Any] = {} if args.steps is None else {"eval_freq": None}
+        changes: dict[str, Any] = {**evaluation, **({} if args.steps is None else {"eval_freq": None})}
         return [replace(run, overrides={**run.overrides, **overrides}, **changes) for run in runs]
     return [
-        Run(algo, algo, env, seed, str(args.out), overrides=overrides, eval_episodes=args.eval_episodes, **common)
+        Run(algo, algo, env, seed, str(args.out), overrides=overrides, **evaluation, **common)
         for seed in (args.seeds or (0, 1, 2))
         for env in args.envs
         for algo in args.algos
@@ -210,7 +213,7 @@ def main(arguments: list[str]) -> int:
     """
     :param arguments: what stands behind ``sb3-chdp benchmark``
     :return: 0, or 1 if runs failed
-    :raises ArgumentsError: for a module of ``--gym-packages`` that there is not
+    :raises ArgumentsError: for a module of ``--gym-packages`` or a run of the published table that there is not
     """
     args, options = parse(arguments)
     console = Console()

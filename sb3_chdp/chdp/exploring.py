@@ -84,12 +84,19 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         self._claims = explore(self.policy, observation, rows[envs], envs, rng, None if masks is None else masks[envs])
         return self._claims.rows
 
-    def _store_transition(self, replay_buffer: ReplayBuffer, *args: Any) -> None:
-        rows, new_obs, rewards, dones, infos = args
-        self._add_rewards(rows, rewards)
-        super()._store_transition(replay_buffer, *args)
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: Any,
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        self._add_rewards(buffer_action, reward)
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         if self._claims is not None and self._n_updates >= MIN_UPDATES:
-            self._check_claims(self._claims, rows, new_obs, rewards, dones, infos)
+            self._check_claims(self._claims, buffer_action, new_obs, reward, dones, infos)
         self._claims = None
         self._count_returns(dones)
 
@@ -137,4 +144,5 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
 
     def _on_step(self) -> None:
         super()._on_step()
-        self.logger.record("rollout/foresight", self.foresight_sums.weight())
+        if self.policy.reward_optimizer is not None:  # PaperCHDP has no foresight
+            self.logger.record("rollout/foresight", self.foresight_sums.weight())

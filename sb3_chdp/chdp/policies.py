@@ -185,8 +185,8 @@ class CHDPPolicy(HybridPolicy):
         make: Callable[..., th.optim.Optimizer] = self.optimizer_class
         return make(list(network.parameters()), lr=lr_schedule(1), **self.optimizer_kwargs)
 
-    # Acting and next actions have the target critics' features. Where features are learnt, those of today mean something else,
-    # and the online networks cannot read them
+    # Acting and next actions have the target critics' features. Where features are learnt, the online networks know others:
+    # the targets act and choose
     @property
     def acting_actor(self) -> CooperativeActor:
         """The policies that act while training."""

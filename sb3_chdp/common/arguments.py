@@ -34,8 +34,8 @@ def is_number(value: Any) -> bool:
     return is_real and (isinstance(value, Integral) or math.isfinite(value))
 
 
-def is_class_of(value: Any, kind: type) -> bool:
-    """:return: whether this is a class, and one derived from another"""
+def is_class_of(value: Any, kind: type | tuple[type, ...]) -> bool:
+    """:return: whether this is a class, and one derived from another, or from one of several"""
     return isinstance(value, type) and issubclass(value, kind)
 
 

@@ -25,8 +25,8 @@ from sb3_chdp.common.arguments import (
     SWITCH,
     Accepted,
     check,
-    check_arguments,
     check_load,
+    is_class_of,
     is_number,
     number,
     of_networks,
@@ -65,7 +65,7 @@ class HybridAlgorithm(BaseAlgorithm):
         "gamma": FRACTION,
         "max_grad_norm": optional(POSITIVE),
         "action_layout": of_networks(one_of(LAYOUTS)),
-        "use_masking": SWITCH,
+        "use_masking": optional(SWITCH),
         "stats_window_size": whole(1),
         "seed": SEED,
     }
@@ -74,8 +74,8 @@ class HybridAlgorithm(BaseAlgorithm):
     hybrid_space: HybridBox
     # Whether rows may have a column for every discrete choice, or only one for the joint index of all
     takes_factored: ClassVar[bool] = False
-    # Whether the environment is asked for the discrete actions that it allows
-    use_masking: bool = False
+    # Whether the environment is asked for the discrete actions that it allows; None: as long as none has said whether it can
+    use_masking: bool | None = None
     # An array or a dict of arrays, which SB3's own annotations hand on where one of them is accepted
     _last_obs: Any
     _native_env: NativeActionVecEnv | None = None
@@ -110,12 +110,6 @@ class HybridAlgorithm(BaseAlgorithm):
         if self._native_env is None or self._native_env.venv is not env:
             self._native_env = NativeActionVecEnv(env, self.hybrid_space)
         return self._native_env
-
-    def _resolve_masking(self, use_masking: bool | None) -> bool:
-        """:return: whether to ask the environment for masks, by default if it has them"""
-        if use_masking is None:
-            return self.env is not None and is_masking_supported(self.env)
-        return use_masking
 
     def _action_masks(self) -> np.ndarray | None:
         """:return: (n_envs, K) which discrete actions the environments allow now, None without masking"""
@@ -178,9 +172,11 @@ class HybridAlgorithm(BaseAlgorithm):
         return super()._get_policy_from_name(policy_name)
 
     def _setup_model(self) -> None:
-        check_arguments(self)
         if self.tensorboard_log is not None:
             self.tensorboard_log = str(self.tensorboard_log)  # a Path would be pickled
+        kinds = tuple(self.policy_aliases.values())
+        own = Accepted(f"one of {tuple(self.policy_aliases)} or derived from one", lambda kind: is_class_of(kind, kinds))
+        check(own, policy=self.policy_class)
         takes_dicts = issubclass(self.policy_class, self.policy_aliases.get("MultiInputPolicy", ()))
         if takes_dicts and not isinstance(self.observation_space, spaces.Dict):
             raise ValueError(
@@ -191,6 +187,8 @@ class HybridAlgorithm(BaseAlgorithm):
         of_algorithm = self._network_kwargs()
         for name in self.policy_kwargs.keys() & of_algorithm.keys():
             raise ValueError(f"policy_kwargs must not have {name!r}: it is an argument of {type(self).__name__} itself")
+        if self.use_masking is None and self.env is not None and is_masking_supported(self.env):
+            self.use_masking = True
         native_space, policy_kwargs = self.action_space, self.policy_kwargs
         self.hybrid_space = self._make_rows()
         # Buffer and policy are built for the rows; the model keeps the user's space
@@ -251,8 +249,13 @@ class HybridAlgorithm(BaseAlgorithm):
     def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         # Less than 0 if a training that goes on is through already
         check(Accepted("a finite number", is_number), total_timesteps=total_timesteps)
-        if self.use_masking and self.env is not None and not is_masking_supported(self.env):
-            raise ValueError("use_masking is True but the environment has no method action_masks()")
+        if self.use_masking is not False and self.env is not None and is_masking_supported(self.env) != bool(self.use_masking):
+            if self.use_masking:
+                raise ValueError("use_masking is True but the environment has no method action_masks()")
+            warnings.warn(
+                "The environment has action_masks(), that of the model's set-up had none: forbidden actions are taken. Load "
+                "the model with env=..., or say use_masking=False"
+            )
         with uncounted_if_refused(self._vec_normalize_env):
             total_timesteps, callback = super()._setup_learn(total_timesteps, *args, **kwargs)
             assert self.env is not None, "You must set the environment before calling learn()"

@@ -5,7 +5,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_chdp.common.arguments import constructor_defaults
 from sb3_chdp.common.space_tree import leaves_of
@@ -57,15 +57,23 @@ def check_is_env(env: Any) -> None:
         raise ValueError(f"env must be an environment of Gymnasium's, a VecEnv of SB3's, or an id, got {env!r}")
 
 
-def check_replayed_images(env: VecEnv | None) -> None:
+def _shapes(space: spaces.Space[Any]) -> Any:
+    return {key: part.shape for key, part in space.items()} if isinstance(space, spaces.Dict) else space.shape
+
+
+def check_replayed_observations(env: VecEnv | None) -> None:
     """
     :param env: the environment of an algorithm with a replay buffer
-    :raises ValueError: if images are transposed around ``VecNormalize``, which hands what it got to the buffer
+    :raises ValueError: if observations get another shape around ``VecNormalize``, which hands what it got to the buffer
     """
-    if isinstance(env, VecTransposeImage) and unwrap_vec_normalize(env) is not None:
+    normalize = None if env is None else unwrap_vec_normalize(env)
+    if env is None or normalize is None:
+        return
+    inside, outside = _shapes(normalize.observation_space), _shapes(env.observation_space)
+    if inside != outside:
         raise ValueError(
-            "env must be VecNormalize(VecTransposeImage(env)), so that the replay buffer gets images as the policy does, got "
-            "VecNormalize around images whose channels come last"
+            "env must have VecNormalize around all that reshapes observations, as VecNormalize(VecTransposeImage(env)) has, "
+            f"so that the replay buffer gets what the policy does, got shapes {inside} in VecNormalize and {outside} around it"
         )
 
 

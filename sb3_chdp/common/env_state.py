@@ -109,8 +109,8 @@ def save_env(env: VecEnv) -> dict[str, Any]:
         raise ValueError(f"get_state() must give numbers, strings, arrays, lists and dicts of these, got {state['states']}")
     envs = local_envs(env)
     if envs is None:
-        names = [name for name in REMOTE_ATTRIBUTES if env.has_attr(name)]
-        state["remote"] = {name: env.get_attr(name) for name in names}
+        values = {name: env.get_attr(name) for name in REMOTE_ATTRIBUTES if env.has_attr(name)}
+        state["remote"] = {name: value for name, value in values.items() if is_plain(value)}
         return state
     state["wrappers"] = []
     for each in envs:

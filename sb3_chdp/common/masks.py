@@ -73,3 +73,25 @@ def env_masks(spec: HybridActionSpec, env: VecEnv) -> np.ndarray:
     :raises ValueError: see :func:`read_masks`
     """
     return read_masks(spec, env.env_method("action_masks"), env.num_envs)
+
+
+def last_masks(
+    spec: HybridActionSpec, before: np.ndarray, masks: np.ndarray, dones: np.ndarray, infos: list[dict[str, Any]]
+) -> np.ndarray:
+    """
+    Masks of the states that a step led to. Where it ended an episode, the environment has been reset, and its mask is lost.
+
+    :param spec: the action space
+    :param before: (n_envs, K) masks of the states before the step
+    :param masks: (n_envs, K) masks of today's states
+    :param dones: (n_envs,) which episodes ended
+    :param infos: those of the step
+    :return: (n_envs, K) masks, at a time limit ``info["action_masks"]`` if it is there, else the one before; of a terminal
+        state none is needed
+    :raises ValueError: see :func:`read_masks`
+    """
+    masks = masks.copy()
+    for i in np.flatnonzero(dones).tolist():
+        given = infos[i].get(INFO_KEY) if infos[i].get("TimeLimit.truncated", False) else None
+        masks[i] = before[i] if given is None else read_masks(spec, given, 1, first=i)[0]
+    return masks

@@ -1,13 +1,13 @@
-"""Replay of more than one step of an episode: where it ends, and n-step returns with what is known of the last state."""
+"""n-step returns with what rows know of the last of the n states."""
 
-import warnings
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
-from stable_baselines3.her import HerReplayBuffer
 
+from sb3_chdp.common.arguments import Accepted, is_class_of
 from sb3_chdp.common.hybrid_box import HybridBox
 
 
@@ -41,20 +41,26 @@ class HybridNStepReplayBuffer(NStepReplayBuffer):
         return samples
 
 
-def end_trajectories(buffer: ReplayBuffer) -> None:
-    """
-    Let unfinished episodes end with the newest transitions, as at a time limit: what is added next comes of a reset.
+# What rows say about the next state is that of the last of n steps
+TELLS_LAST = Accepted(
+    "derived from HybridNStepReplayBuffer if it is one of n steps",
+    lambda kind: not is_class_of(kind, NStepReplayBuffer) or issubclass(kind, HybridNStepReplayBuffer),
+)
 
-    :param buffer: the replay buffer, which may be empty
+
+def n_step_settings(
+    kind: type[ReplayBuffer] | None, kwargs: dict[str, Any], n_steps: int, gamma: float, has_dicts: bool
+) -> tuple[type[ReplayBuffer] | None, dict[str, Any]]:
     """
-    if buffer.size() == 0:
-        return
-    newest = (buffer.pos - 1) % buffer.buffer_size
-    if isinstance(buffer, HerReplayBuffer):
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="The last trajectory in the replay buffer")
-            buffer.truncate_last_trajectory()
-    elif buffer.optimize_memory_usage:
-        buffer.dones[newest] = 1  # the next observation, which it takes from what is added next, counts for nothing
-    else:
-        buffer.timeouts[newest] = np.maximum(buffer.timeouts[newest], 1 - buffer.dones[newest])
+    :param kind: class of the replay buffer, None if the user names none
+    :param kwargs: its keyword arguments, as far as the user names them
+    :param n_steps: that of the algorithm; with 1 the default of a buffer of n steps holds
+    :param gamma: that of the algorithm
+    :param has_dicts: whether observations are dicts, of which SB3 refuses n-step returns
+    :return: class and keyword arguments of the buffer to make
+    """
+    if kind is NStepReplayBuffer or (kind is None and n_steps > 1 and not has_dicts):
+        kind = HybridNStepReplayBuffer
+    if is_class_of(kind, NStepReplayBuffer):
+        kwargs = {"gamma": gamma, **({"n_steps": n_steps} if n_steps > 1 else {}), **kwargs}
+    return kind, dict(kwargs)

@@ -8,32 +8,39 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_chdp.common.arguments import FRACTION, SWITCH, TRAIN_FREQ, Accepted, check, check_device, is_class_of, optional, whole
+from sb3_chdp.common.arguments import (
+    FRACTION,
+    SWITCH,
+    TRAIN_FREQ,
+    Accepted,
+    check,
+    check_arguments,
+    check_device,
+    is_class_of,
+    optional,
+    whole,
+)
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.buffer_file import check_buffer, load_buffer, save_buffer
-from sb3_chdp.common.checks import check_numbers, check_replayed_images
-from sb3_chdp.common.masks import INFO_KEY, read_masks
-from sb3_chdp.common.n_step_buffer import HybridNStepReplayBuffer, end_trajectories
+from sb3_chdp.common.checks import check_numbers, check_replayed_observations
+from sb3_chdp.common.masks import last_masks
+from sb3_chdp.common.n_step_buffer import TELLS_LAST, n_step_settings
 from sb3_chdp.common.policies import HybridPolicy
 from sb3_chdp.common.rows import MASK_PARTS, pack_bits
 from sb3_chdp.common.safe_zip import refuse
 from sb3_chdp.common.samples import HybridReplaySamples, name_columns
+from sb3_chdp.common.trajectories import end_trajectories
 
 # Bytes of actions in a replay buffer that deserve a warning
 LARGE_ROWS = 2**30
-# What rows say about the next state is that of the last of n steps
-TELLS_LAST = Accepted(
-    "derived from HybridNStepReplayBuffer if it is one of n steps",
-    lambda kind: not is_class_of(kind, NStepReplayBuffer) or issubclass(kind, HybridNStepReplayBuffer),
-)
 
 SelfHybridOffPolicyAlgorithm = TypeVar("SelfHybridOffPolicyAlgorithm", bound="HybridOffPolicyAlgorithm")
 
@@ -59,6 +66,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         "policy_delay": whole(1),
         "action_noise": optional(Accepted("an ActionNoise of SB3's", lambda value: isinstance(value, ActionNoise))),
         "replay_buffer_class": optional(Accepted("a class of replay buffers", lambda value: is_class_of(value, ReplayBuffer))),
+        "replay_buffer_kwargs": Accepted("a dict, or None", lambda value: isinstance(value, dict)),
     }
     policy: HybridPolicy
 
@@ -116,24 +124,21 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
             support_multi_env=True,
         )
         self.action_layout = action_layout
-        self.use_masking = self._resolve_masking(use_masking)
+        self.use_masking = use_masking
 
     def _setup_model(self) -> None:
-        # With n-step returns SB3 refuses them
-        has_dicts = isinstance(self.observation_space, spaces.Dict)
+        check_arguments(self)
         given = self.replay_buffer_class, self.replay_buffer_kwargs
         try:
             with warnings.catch_warnings():
-                kind, self.replay_buffer_kwargs = self.replay_buffer_class, dict(self.replay_buffer_kwargs)
-                if kind is None and self.n_steps != 1 and not has_dicts:
-                    # In place of SB3's, which it would choose; its warning that n_steps does not count is wrong here
+                if self.replay_buffer_class is None:
+                    # SB3's, that n_steps does not count, is wrong here
                     warnings.filterwarnings("ignore", message="`n_steps=")
-                    self.replay_buffer_class = HybridNStepReplayBuffer
-                    self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, "n_steps": self.n_steps, "gamma": self.gamma}
-                elif kind is NStepReplayBuffer:
-                    self.replay_buffer_class = HybridNStepReplayBuffer
-                elif self._state_parts():
-                    check(TELLS_LAST, replay_buffer_class=kind)
+                has_dicts = isinstance(self.observation_space, spaces.Dict)
+                settings = n_step_settings(*given, self.n_steps, self.gamma, has_dicts)
+                self.replay_buffer_class, self.replay_buffer_kwargs = settings
+                if self._state_parts():
+                    check(TELLS_LAST, replay_buffer_class=self.replay_buffer_class)
                 super()._setup_model()
         except MemoryError as error:
             raise ValueError(
@@ -173,11 +178,10 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
-        if self._n_updates == 0 and self.num_timesteps <= self.learning_starts:
-            warnings.warn(
-                f"Nothing is learnt yet: the first learning_starts={self.learning_starts} steps are random, and training "
-                f"ended after {self.num_timesteps}"
-            )
+        if self._n_updates == 0:
+            is_early = self.num_timesteps <= self.learning_starts
+            reason = f"the first learning_starts={self.learning_starts} steps are random" if is_early else "no update was due"
+            warnings.warn(f"Nothing is learnt yet: {reason}, and training ended after {self.num_timesteps}")
         return self
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
@@ -221,8 +225,13 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         except BaseException:
             self.replay_buffer = own
             raise
-        self.replay_buffer = buffer
+        self.replay_buffer, self.buffer_size = buffer, buffer.buffer_size * self.n_envs
         buffer.device = self.device
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        super().set_env(env, force_reset)
+        if isinstance(self.replay_buffer, HerReplayBuffer):
+            self.replay_buffer.env = self.env  # which it asks for the rewards of other goals
 
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
         """SB3's ``collect_rollouts``, in which actions are rows."""
@@ -234,7 +243,9 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
     def _setup_learn(
         self, total_timesteps: int, callback: MaybeCallback = None, reset_num_timesteps: bool = True, *args: Any, **kwargs: Any
     ) -> tuple[int, BaseCallback]:
-        check_replayed_images(self.env)
+        check_replayed_observations(self.env)
+        if isinstance(self.action_noise, VectorizedActionNoise) and self.action_noise.n_envs != self.n_envs:
+            self.action_noise = self.action_noise.base_noise  # which SB3 takes as many times as there are environments now
         if self.replay_buffer is not None and (reset_num_timesteps or self._last_obs is None):
             end_trajectories(self.replay_buffer)  # the environment is reset
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
@@ -312,21 +323,11 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """
-        SB3's, with the masks of the next states.
-
-        That of the last state of an episode is lost when the environment is reset. Where a time limit ended the episode it is
-        ``info["action_masks"]`` if the environment leaves it there, else that of the state before; of a terminal state none is
-        needed.
-        """
+        """SB3's, with the masks of the next states."""
         masks = self._action_masks()
         if masks is not None:
             columns = self.hybrid_space.columns
-            next_masks = masks.copy()
-            for i in np.flatnonzero(dones).tolist():
-                given = infos[i].get(INFO_KEY) if infos[i].get("TimeLimit.truncated", False) else None
-                before = columns.masks(buffer_action[i : i + 1])
-                next_masks[i] = (before if given is None else read_masks(self.hybrid_space.spec, given, 1, first=i))[0]
+            next_masks = last_masks(self.hybrid_space.spec, columns.masks(buffer_action), masks, dones, infos)
             columns.view(buffer_action, "next_masks")[:] = pack_bits(next_masks)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 

@@ -5,8 +5,6 @@ import io
 import tempfile
 import time
 import warnings
-from contextlib import suppress
-from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 from weakref import WeakKeyDictionary
@@ -33,6 +31,7 @@ from sb3_chdp.common.run_state import (
     save_generators,
     save_logger,
 )
+from sb3_chdp.common.serialization import import_own
 
 
 class _Run(NamedTuple):
@@ -217,6 +216,7 @@ class ResumableCheckpoint(BaseCallback):
         buffer = getattr(model, "replay_buffer", None)
         if buffer is not None:
             state["buffer"] = buffer_state(buffer)
+            state["buffer_size"] = buffer.buffer_size
             state["rows_per_chunk"] = self._replay.write(buffer, writer)
         text, arrays = to_bytes(state)
         writer.write("state.json", text)
@@ -225,10 +225,7 @@ class ResumableCheckpoint(BaseCallback):
 
 def _algorithm(name: str) -> type[BaseAlgorithm]:
     """:return: the algorithm of that name, of this package or imported already: a checkpoint cannot have others run"""
-    module, package = name.rpartition(".")[0], __name__.partition(".")[0]
-    if module.startswith(f"{package}."):
-        with suppress(ModuleNotFoundError):
-            import_module(module)
+    import_own(name)
     classes: list[type] = [BaseAlgorithm]
     for cls in classes:
         classes.extend(cls.__subclasses__())
@@ -257,7 +254,8 @@ def resume(
     :param kwargs: further arguments of the algorithm's ``load``
     :return: the model, with its replay buffer, environment and random generators where they were
     :raises FileNotFoundError: if there is no checkpoint
-    :raises ValueError: if all checkpoints are damaged, or for another number of environments or other wrappers
+    :raises ValueError: if all checkpoints are damaged, or for another number of environments, other wrappers or another
+        ``buffer_size``
     """
     store = CheckpointStore(directory)
     folder = store.newest()
@@ -274,6 +272,9 @@ def resume(
     restore_model(model, state["model"])
     buffer = _replay_buffer(model)
     if "buffer" in state and buffer is not None:
+        if buffer.buffer_size != state.get("buffer_size", buffer.buffer_size):
+            size, given = (n * vec_env.num_envs for n in (state["buffer_size"], buffer.buffer_size))
+            raise ValueError(f"buffer_size must be {size} like the checkpoint, got {given}")
         restore_state(buffer, state["buffer"])
         read_rows(buffer, folder, state["rows_per_chunk"])
     vec_env.reset()

@@ -10,6 +10,8 @@ import enum
 import sys
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -94,9 +96,21 @@ def qualified_name(kind: type) -> str:
     return f"{kind.__module__}.{kind.__qualname__}"
 
 
+def import_own(name: str) -> None:
+    """
+    Import the module of a class that a file names, if it is of this package: the import of another one could run any code.
+
+    :param name: module and name of the class
+    """
+    module, package = name.rpartition(".")[0], __name__.partition(".")[0]
+    if module.startswith(f"{package}.") and not module.endswith("__main__"):
+        with suppress(ModuleNotFoundError):
+            import_module(module)
+
+
 def _find_class(name: str, kinds: tuple[type, ...] = CLASSES) -> type:
     module, _, attribute = name.rpartition(".")
-    # Only what is imported already: an import could run code
+    import_own(name)
     found = getattr(sys.modules.get(module), attribute, None) if name.startswith(PACKAGES) else None
     if not (isinstance(found, type) and issubclass(found, kinds) and qualified_name(found) == name):
         accepted = [kind.__name__ for kind in kinds]

@@ -207,14 +207,14 @@ class HybridActionSpec:
 
     def to_native(self, row: npt.ArrayLike) -> Any:
         """
-        :param row: (1 + Pmax,) ``[k | scaled parameters]``; parameters are clipped to [-1, 1], padding is ignored
+        :param row: (columns.width,) ``[k | scaled parameters]``; parameters are clipped to [-1, 1], padding is ignored
         :return: the native action; ``space.contains`` holds for it
         """
         return self.to_native_batch(np.asarray(row)[None])[0]
 
     def to_native_batch(self, rows: npt.ArrayLike) -> list[Any]:
         """
-        :param rows: (n, 1 + Pmax) or wider, ``[k | scaled parameters | ignored]``
+        :param rows: (n, columns.width) or wider, ``[k | scaled parameters | ignored]``
         :return: n native actions
         :raises ValueError: if rows are too narrow, have no such discrete action or are not finite
         """
@@ -271,8 +271,11 @@ class HybridActionSpec:
         Inverse of :meth:`to_native`. Parameters of actions that are not chosen have no place in a row and are dropped.
 
         :param action: a native action
-        :return: (1 + Pmax,) float64 ``[k | scaled parameters]``, padding 0
+        :return: (columns.width,) float64 ``[k | scaled parameters]``, padding 0
+        :raises ValueError: if the action is not in the space
         """
+        if not self.space.contains(action):
+            raise ValueError(f"action must be in {self.space}, got {action!r}")
         if isinstance(self.space, spaces.OneOf):
             k = np.array([int(action[0])])
             action = {"option": action[1]}
@@ -312,7 +315,7 @@ class HybridActionSpec:
         :param rng: random generator
         :param n: number of rows
         :param masks: (n, sum of the radices) False for values that may not be taken
-        :return: (n, 1 + Pmax) rows, k uniform over the K actions, parameters uniform in [-1, 1], padding 0
+        :return: (n, columns.width) rows, k uniform over the K actions, parameters uniform in [-1, 1], padding 0
         """
         choices = self.sample_choices(rng, n, masks)
         parameters = rng.uniform(-1.0, 1.0, size=(n, self.max_parameters)) * self.parameter_mask[self.options_of(choices)]
@@ -322,7 +325,7 @@ class HybridActionSpec:
         """
         :param choices: (n,) discrete actions
         :param parameters: (n, P) scaled parameters of all actions, one after the other
-        :return: (n, 1 + Pmax) rows of the chosen actions with their own parameters
+        :return: (n, columns.width) rows of the chosen actions with their own parameters
         """
         options = self.options_of(choices)
         own_parameters = np.take_along_axis(parameters, self.parameter_index[options], axis=1) * self.parameter_mask[options]

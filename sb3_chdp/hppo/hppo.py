@@ -21,7 +21,9 @@ from sb3_chdp.common.arguments import (
     POSITIVE,
     SWITCH,
     Accepted,
+    check_arguments,
     check_device,
+    is_class_of,
     number,
     optional,
     scheduled,
@@ -176,7 +178,7 @@ class HPPO(HybridAlgorithm, PPO):
         self.normalize_advantage = normalize_advantage
         self.target_kl = target_kl
         self.action_layout = action_layout
-        self.use_masking = self._resolve_masking(use_masking)
+        self.use_masking = use_masking
 
         if _init_setup_model:
             self._setup_model()
@@ -185,9 +187,10 @@ class HPPO(HybridAlgorithm, PPO):
         return ConcatenatedBox(self.action_space, action_layout, ("masks",) if self.use_masking else ())
 
     def _setup_model(self) -> None:
+        check_arguments(self)
         hybrid_class = HybridDictRolloutBuffer if isinstance(self.observation_space, spaces.Dict) else HybridRolloutBuffer
         self.rollout_buffer_class = self.rollout_buffer_class or hybrid_class
-        if not issubclass(self.rollout_buffer_class, hybrid_class):
+        if not is_class_of(self.rollout_buffer_class, hybrid_class):
             raise ValueError(f"rollout_buffer_class must be a {hybrid_class.__name__}, got {self.rollout_buffer_class}")
         super()._setup_model()
         buffer_size = self.n_steps * self.n_envs

@@ -150,9 +150,11 @@ class ParameterizedQNetwork(BaseModel):
             first, *hidden, last = q_net.children()
             assert isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
             state_part = F.linear(features, first.weight[:, : self.features_dim], first.bias)
-            # (B, M, Pmax) x (B or 1, M, Pmax, units) -> (B, M, units)
             parameter_weights = first.weight[:, self.features_dim :].t()[columns]
-            parameter_part = (own_parameters[..., None] * parameter_weights).sum(dim=2)
+            if len(k) == 1:  # the same actions for all
+                parameter_part = th.einsum("bmp,mpu->bmu", own_parameters, parameter_weights[0])
+            else:
+                parameter_part = th.einsum("bmp,bmpu->bmu", own_parameters, parameter_weights)
             units = nn.Sequential(*hidden)(state_part[:, None] + parameter_part)
             values.append((units * last.weight[k]).sum(dim=2) + last.bias[k])
         q1, q2 = values
