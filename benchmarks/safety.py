@@ -16,8 +16,8 @@ from timing import ENV_ID, build, medians
 
 from sb3_chdp import CHDP, HPPO, PATD3
 from sb3_chdp.chdp import PaperCHDP
-from sb3_chdp.common.native_env import NativeActionVecEnv
 from sb3_chdp.common.resume import ResumableCheckpoint
+from sb3_chdp.common.row_env import RowVecEnv
 
 
 def unguarded_step(
@@ -53,7 +53,7 @@ def guards(repeats: int) -> Iterator[str]:
     cases.append(("HPPO, 16 minibatches", [of_losses(hppo)], lambda: hppo.train()))
     acting = build(PATD3, **big)
     collect = lambda: acting.learn(400, reset_num_timesteps=False)  # noqa: E731
-    of_data = (NativeActionVecEnv, "step_wait", lambda env: env.venv.step_wait())
+    of_data = (RowVecEnv, "step_wait", lambda env: env.venv.step_wait())
     cases.append(("PA-TD3, 400 steps of 8 environments", [of_data], collect))
     whole = lambda: hppo.learn(1024, reset_num_timesteps=False)  # noqa: E731
     cases.append(("HPPO, 1,024 steps of 8 environments and what they teach in one epoch", [of_losses(hppo), of_data], whole))

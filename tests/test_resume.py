@@ -167,7 +167,8 @@ def test_replay_buffers_of_another_size(tmp_path):
     model.learn(30, ResumableCheckpoint(10, tmp_path / "run"), reset_num_timesteps=False)
     with pytest.raises(ValueError, match="buffer_size must be 20 like the checkpoint, got 500"):
         resume(tmp_path / "run", make_env(1), buffer_size=500)
-    assert resume(tmp_path / "run", make_env(1)).replay_buffer.size() == 20
+    resumed = resume(tmp_path / "run", make_env(1))
+    assert isinstance(resumed, PATD3) and resumed.replay_buffer.size() == 20
 
 
 def test_wrong_use(tmp_path):

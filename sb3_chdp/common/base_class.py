@@ -37,9 +37,9 @@ from sb3_chdp.common.arguments import (
 from sb3_chdp.common.checks import check_is_env, check_observation_space, check_policy_kwargs
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.masks import env_masks
-from sb3_chdp.common.native_env import NativeActionVecEnv, uncounted_if_refused
 from sb3_chdp.common.policies import HybridPolicy
 from sb3_chdp.common.resume import last_checkpoint
+from sb3_chdp.common.row_env import RowVecEnv, uncounted_if_refused
 from sb3_chdp.common.safe_zip import VERSION, misfit, read_model, save_model
 from sb3_chdp.common.spaces import LAYOUTS, MAX_DISCRETE_ACTIONS
 from sb3_chdp.common.utils import NonFiniteLossError
@@ -54,7 +54,7 @@ class HybridAlgorithm(BaseAlgorithm):
     Mixin for SB3's algorithms, to be named before them.
 
     ``model.action_space`` is the user's space; environments and ``predict`` deal in native actions. Buffers and networks
-    deal in rows of numbers, see :class:`HybridBox`. Rollouts step :meth:`native_env`, which converts the one to the other.
+    deal in rows of numbers, see :class:`HybridBox`. Rollouts step :meth:`row_env`, which converts the one to the other.
     """
 
     # What arguments may be, by name; subclasses have tables of their own for what they add or narrow
@@ -78,7 +78,7 @@ class HybridAlgorithm(BaseAlgorithm):
     use_masking: bool | None = None
     # An array or a dict of arrays, which SB3's own annotations hand on where one of them is accepted
     _last_obs: Any
-    _native_env: NativeActionVecEnv | None = None
+    _row_env: RowVecEnv | None = None
 
     @staticmethod
     def _wrap_env(env: GymEnv | str, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -101,15 +101,15 @@ class HybridAlgorithm(BaseAlgorithm):
             )
         return vec_env
 
-    def native_env(self, env: VecEnv) -> NativeActionVecEnv:
+    def row_env(self, env: VecEnv) -> RowVecEnv:
         """
         :param env: the training environment
-        :return: the same for rows instead of native actions
+        :return: the same, which takes rows in place of native actions
         """
         # Kept: SB3 collects rollouts of a single step, and a new wrapper asks all subprocesses for their render mode
-        if self._native_env is None or self._native_env.venv is not env:
-            self._native_env = NativeActionVecEnv(env, self.hybrid_space)
-        return self._native_env
+        if self._row_env is None or self._row_env.venv is not env:
+            self._row_env = RowVecEnv(env, self.hybrid_space)
+        return self._row_env
 
     def _action_masks(self) -> np.ndarray | None:
         """:return: (n_envs, K) which discrete actions the environments allow now, None without masking"""
@@ -149,7 +149,7 @@ class HybridAlgorithm(BaseAlgorithm):
         """
         return HybridBox(self.action_space, action_layout)
 
-    def _make_rows(self) -> HybridBox:
+    def _choose_hybrid_space(self) -> HybridBox:
         """:return: what :meth:`_make_hybrid_space` makes, with one index for algorithms that need it"""
         space = self._make_hybrid_space(self.action_layout)
         if self.takes_factored or not space.spec.is_factored:
@@ -190,7 +190,7 @@ class HybridAlgorithm(BaseAlgorithm):
         if self.use_masking is None and self.env is not None and is_masking_supported(self.env):
             self.use_masking = True
         native_space, policy_kwargs = self.action_space, self.policy_kwargs
-        self.hybrid_space = self._make_rows()
+        self.hybrid_space = self._choose_hybrid_space()
         # Buffer and policy are built for the rows; the model keeps the user's space
         self.action_space = self.hybrid_space
         self.policy_kwargs = {**policy_kwargs, **of_algorithm}
@@ -260,14 +260,14 @@ class HybridAlgorithm(BaseAlgorithm):
             total_timesteps, callback = super()._setup_learn(total_timesteps, *args, **kwargs)
             assert self.env is not None, "You must set the environment before calling learn()"
             try:
-                self.native_env(self.env).check_observations(self._last_obs)
+                self.row_env(self.env).check_observations(self._last_obs)
             except ValueError:
                 self._last_obs = None  # learning begins with a reset again
                 raise
         return total_timesteps, callback
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "hybrid_space", "_native_env"]
+        return [*super()._excluded_save_params(), "hybrid_space", "_row_env"]
 
     def save(
         self,

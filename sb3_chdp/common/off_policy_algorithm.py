@@ -235,7 +235,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
 
     def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> RolloutReturn:
         """SB3's ``collect_rollouts``, in which actions are rows."""
-        rollout = super().collect_rollouts(self.native_env(env), *args, **kwargs)
+        rollout = super().collect_rollouts(self.row_env(env), *args, **kwargs)
         if not rollout.continue_training:
             self._last_obs = None  # the last step was not stored: learning begins with a reset again
         return rollout

@@ -205,7 +205,7 @@ class HPPO(HybridAlgorithm, PPO):
     ) -> bool:
         """SB3's ``collect_rollouts``, with masks for the policy and rows that the environment gets as native actions."""
         assert self._last_obs is not None and self._last_episode_starts is not None, "No previous observation was provided"
-        native_env = self.native_env(env)
+        row_env = self.row_env(env)
         self.policy.set_training_mode(False)
         rollout_buffer.reset()
         callback.on_rollout_start()
@@ -215,7 +215,7 @@ class HPPO(HybridAlgorithm, PPO):
                 obs_tensor = obs_as_tensor(self._last_obs, self.device)
                 row_tensor, values, log_probs = self.policy(obs_tensor, action_masks=self._action_masks())
             actions = row_tensor.cpu().numpy()
-            new_obs, rewards, dones, infos = native_env.step(actions)
+            new_obs, rewards, dones, infos = row_env.step(actions)
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
             if not callback.on_step():

@@ -33,7 +33,7 @@ def uncounted_if_refused(normalize: VecNormalize | None) -> Iterator[None]:
         raise
 
 
-class NativeActionVecEnv(VecEnvWrapper):
+class RowVecEnv(VecEnvWrapper):
     """
     Environment that takes rows, which the wrapped one gets as native actions.
 
