@@ -114,8 +114,9 @@ class _Player:
         self.n_ends = self.n_successes = 0
         # Length of each random episode, and whether it ended by termination
         self.episodes: list[tuple[int, bool]] = []
-        self.overwrites = False
-        # Of float64 observations by key: how often an entry changed, and how often in float32 too
+        self.overwrites = self.reuses_info = False
+        self._last_info: dict[str, Any] | None = None
+        # Of observations by key: how often an entry changed, and how often in float32 too
         self.changes: dict[str, np.ndarray] = {}
 
     def reset(self, **kwargs: Any) -> Any:
@@ -161,6 +162,8 @@ class _Player:
             if not isinstance(value, bool):
                 raise AssertionError(f"{name} must be a bool, got {value!r}: return bool({name})")
         self._check_info(info, "step()")
+        self.reuses_info |= info is self._last_info
+        self._last_info = info
         if terminated or truncated:
             self.n_ends += 1
             self.n_successes += "is_success" in info
@@ -227,12 +230,14 @@ class _Player:
                 self.episodes.append((length, terminated))
                 if len(self.episodes) == N_EPISODES:
                     break
+                kept, before = obs, deepcopy(obs)
                 obs, length = self.reset(), 0
+                self.overwrites |= not data_equivalence(kept, before, exact=True)
 
     def _count_changes(self, before: Any, obs: Any) -> None:
         parts = obs if isinstance(obs, dict) else {"": obs}
         for key, part in parts.items():
-            if isinstance(part, np.ndarray) and part.dtype == np.float64:
+            if isinstance(part, np.ndarray) and part.dtype.kind in "fiu" and part.dtype.itemsize >= 4:
                 former = before[key] if key else before
                 changed = [part != former, part.astype(np.float32) != former.astype(np.float32)]
                 self.changes[key] = self.changes.get(key, 0) + np.array(changed)
@@ -265,7 +270,9 @@ class _Player:
                     "what is the same in all states"
                 )
         if self.overwrites:
-            found.append("step() overwrites the observation that it returned before: return a copy, obs.copy()")
+            found.append("step() or reset() overwrites the observation that was returned before: return a copy, obs.copy()")
+        if self.reuses_info:
+            found.append("step() returns the same info every time, in which wrappers leave their notes: return a new dict")
         return found
 
     def seed_oddity(self) -> str | None:
@@ -274,7 +281,8 @@ class _Player:
             return None
         return (
             "Two runs with reset(seed=1) and the same actions differ: call super().reset(seed=seed) and draw random numbers "
-            "from self.np_random only, so that trainings can be repeated"
+            "from self.np_random only, so that trainings can be repeated. If a wrapper keeps statistics, check the "
+            "environment without it"
         )
 
     def layout_oddity(self) -> str | None:
@@ -287,7 +295,7 @@ class _Player:
         return (
             "Parameters of other actions than the chosen one have an effect. If every action has all of them, give the "
             "algorithm, and this function, action_layout='shared'. Else put them in the order of the actions: action 0 has "
-            f"{self.spec.names_of(0)}, action 1 {self.spec.names_of(1)}, and so on; a Dict sorts its keys"
+            f"{self.spec.names_of(0)}, action 1 {self.spec.names_of(1)}, and so on; a Dict made of a plain dict sorts its keys"
         )
 
     def _run(self, spec: HybridActionSpec) -> list[Any]:

@@ -83,6 +83,17 @@ def one_array(self):
     return self.kept
 
 
+def kept_observation(self):
+    self.kept = Walk.observation(self)
+    return self.kept
+
+
+def reset_in_place(self, *, seed=None, options=None):
+    before = self.__dict__.get("kept", np.zeros(2, np.float32))
+    before[:] = Walk.reset(self, seed=seed)[0]
+    return before, {}
+
+
 def far_away_at_times(self):
     return np.array([0, 1.5 if self.t == 15 else 0.5], dtype=np.float32)
 
@@ -97,6 +108,10 @@ ERRORS = {
     "no_env": (lambda: object(), "env is a object: derive the class from gymnasium.Env"),
     "no_action_space": (lambda: walk(action_space=None), "env.action_space is None: set it in __init__ to a space"),
     "only_boxes": (lambda: walk(action_space=PLANE), "must be a Tuple, Dict or OneOf with a discrete and a continuous part"),
+    "key_of_modules": (
+        lambda: observing(spaces.Dict({"type": PLANE})),
+        "observation_space has the key 'type', which PyTorch takes for no name: rename it",
+    ),
     "unbounded": (
         lambda: walk(action_space=spaces.Tuple((spaces.Discrete(2), box(-np.inf, 1, 2)))),
         "action_space[1] is unbounded or has NaN bounds (Box(-inf, 1.0, (2,), float32)); give it finite bounds, in the "
@@ -210,7 +225,7 @@ WARNINGS = {
             action_space=spaces.Tuple((spaces.Discrete(2), spaces.Dict({"run": PLANE, "hop": PLANE}))),
             reward=lambda self, action: float(action[1][["run", "hop"][action[0]]][0]),
         ),
-        "action 0 has action_space[1]['hop'], action 1 action_space[1]['run'], and so on; a Dict sorts its keys",
+        "action 0 has action_space[1]['hop'], action 1 action_space[1]['run'], and so on; a Dict made of a plain dict sorts",
     ),
     "no_end": (
         lambda: walk(terminated=False, truncated=False),
@@ -232,7 +247,16 @@ WARNINGS = {
         lambda: observing(spaces.Box(0, np.inf, (2,), np.float64), lambda self: np.array([self.t, 1.7e9 + self.t])),
         "observation changes at [[1]] by less than float32 can hold, in which policies read it: subtract",
     ),
-    "overwritten": (lambda: walk(observation=one_array), "overwrites the observation that it returned before: return a copy"),
+    "clock_in_whole_numbers": (
+        lambda: observing(spaces.Box(0, 2**40, (2,), np.int64), lambda self: np.array([self.t, 1_700_000_000 + self.t])),
+        "observation changes at [[1]] by less than float32 can hold, in which policies read it: subtract",
+    ),
+    "overwritten": (lambda: walk(observation=one_array), "step() or reset() overwrites the observation that was returned"),
+    "overwritten_by_reset": (
+        lambda: walk(observation=kept_observation, reset=reset_in_place),
+        "step() or reset() overwrites the observation that was returned before: return a copy",
+    ),
+    "one_info": (lambda: walk(info={}), "step() returns the same info every time, in which wrappers leave their notes"),
 }
 
 
@@ -240,6 +264,7 @@ SOUND = {
     "walk": Walk,
     "success_at_the_end_only": lambda: walk(terminated=False, info=lambda self: {"is_success": True} if self.t == 20 else {}),
     "forbidden_actions": MaskedEnv,
+    "float16": lambda: observing(spaces.Box(-1, 1, (2,), np.float16), lambda self: Walk.observation(self).astype(np.float16)),
     "own_parameters": lambda: walk(
         action_space=spaces.Tuple((spaces.Discrete(2), spaces.Dict({"run": PLANE, "hop": PLANE}))),
         reward=lambda self, action: float(action[1][["hop", "run"][action[0]]][0]),

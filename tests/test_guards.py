@@ -312,3 +312,18 @@ def test_a_diverged_training_stops(algorithm, with_checkpoint, tmp_path):
     assert not has_learnt(model, weights)
     if with_checkpoint:
         assert goes_on(resume(tmp_path, make_shared_env()), make_shared_env())
+
+
+@pytest.mark.parametrize("in_dict", [False, True])
+@pytest.mark.parametrize("place", ["first", "next", "terminal"])
+def test_discrete_observations_outside_of_their_space(algorithm, place, in_dict):
+    class Cells(BrokenEnv):
+        def broken(self, obs):
+            return {"cell": np.int64(4)} if in_dict else np.int64(4)
+
+    cells: spaces.Space = spaces.Dict({"cell": spaces.Discrete(4)}) if in_dict else spaces.Discrete(4)
+    model = make_model(algorithm, Cells(place, 4, cells), "MultiInputPolicy" if in_dict else "MlpPolicy")
+    with pytest.raises(ValueError, match=r"observation.* must be in Discrete\(4\), got \[4\] from environment\(s\) \[0\]"):
+        model.learn(60)
+    model.set_env(LayoutEnv(layouts()["shared"], cells))
+    model.learn(60)

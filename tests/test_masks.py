@@ -235,6 +235,12 @@ def test_masks_of_parts_and_of_joint_actions():
     assert read_masks(HybridActionSpec(bits, "joint"), np.ones(128, dtype=bool), 1).all()
 
 
+def test_masks_that_are_no_vector():
+    spec = HybridActionSpec(layouts()["product"])
+    with pytest.raises(ValueError, match=r"got shape \(3, 2\); flatten it, masks.ravel\(\)"):
+        read_masks(spec, np.ones((3, 2), dtype=bool), 1)
+
+
 def test_nearest_allowed_row():
     points, table = th.randn(200, 3), th.randn(40, 3)
     masks = th.rand(200, 40) < 0.2

@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chdp import CHDP
 from tests.algorithms import OFF_POLICY_ALGORITHMS, make_model
-from tests.hybrid_envs import make_layout_env
+from tests.hybrid_envs import LayoutEnv, layouts, make_layout_env
 
 
 def test_deterministic_predictions_repeat(algorithm):
@@ -92,3 +94,36 @@ def test_action_noise_of_the_user(off_policy_algorithm, n_envs):
     model = make_model(off_policy_algorithm, env, action_noise=wrong)
     with pytest.raises(ValueError, match=f"action_noise must have size {size} per environment"):
         model.learn(30)
+
+
+@pytest.mark.parametrize(
+    "space", [spaces.Box(0, 199, (2,), np.int32), spaces.Box(0, 255, (2,), np.uint8), spaces.Discrete(50)], ids=str
+)
+@pytest.mark.parametrize("in_dict", [False, True])
+def test_last_states_behind_normalization_are_the_originals(off_policy_algorithm, space, in_dict):
+    class Counter(LayoutEnv):
+        """The observation is the number of all steps so far."""
+
+        n = 0
+
+        def __init__(self):
+            super().__init__(layouts()["shared"], spaces.Dict({"n": space}) if in_dict else space)
+
+        def _obs(self):
+            obs = np.full(space.shape, self.n, space.dtype) if space.shape else np.int64(self.n)
+            return {"n": obs} if in_dict else obs
+
+        def reset(self, **kwargs):
+            return self._obs(), super().reset(**kwargs)[1]
+
+        def step(self, action):
+            rest = super().step(action)[1:]
+            self.n += 1
+            return self._obs(), *rest
+
+    env = VecNormalize(make_vec_env(Counter, 1), norm_obs=bool(space.shape))
+    policy = "MultiInputPolicy" if in_dict else "MlpPolicy"
+    buffer = make_model(off_policy_algorithm, env, policy).learn(45).replay_buffer
+    stored, following = (part["n"] if in_dict else part for part in (buffer.observations, buffer.next_observations))
+    for part, first in ((stored, 0), (following, 1)):
+        np.testing.assert_array_equal(part[:45].reshape(45, -1)[:, 0], np.arange(first, 45 + first))

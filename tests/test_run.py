@@ -239,6 +239,12 @@ def test_bad_observations_for_predict(algorithm):
         model.predict((np.zeros(2, dtype=np.float32), {}))
 
 
+def test_no_observation_no_action(algorithm):
+    model = make_model(algorithm, make_layout_env())
+    for deterministic in (False, True):
+        assert model.predict(np.zeros((0, 2), np.float32), deterministic=deterministic)[0] == []
+
+
 def test_unknown_policy_kwargs(algorithm):
     with pytest.raises(ValueError, match=r"unknown key\(s\) \['n_neurons'\].*net_arch"):
         make_model(algorithm, make_layout_env(), policy_kwargs=dict(n_neurons=3))
@@ -255,12 +261,13 @@ def test_actions_that_are_not_hybrid(algorithm, space):
     [
         (LayoutEnv, r"an environment, got the class LayoutEnv: give an object of it, LayoutEnv\(\)"),
         (3, "an environment of .* got 3"),
+        (None, "an environment of .* got None"),
         (
             gym.make_vec("sb3_chdp/Goal-v0", 2, "sync"),
             r"a VecEnv of SB3's, as make_vec_env\(\) .* got Gymnasium's SyncVectorEnv",
         ),
     ],
-    ids=["class", "number", "vector"],
+    ids=["class", "number", "none", "vector"],
 )
 def test_what_is_no_environment(algorithm, env, message):
     with pytest.raises(ValueError, match=f"env must be {message}"):

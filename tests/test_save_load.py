@@ -3,11 +3,13 @@
 import io
 import warnings
 import zipfile
+from collections import OrderedDict
 from copy import deepcopy
 
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import TD3
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
@@ -17,7 +19,7 @@ from stable_baselines3.her import HerReplayBuffer
 from sb3_chdp import FlattenHybridAction
 from sb3_chdp.common.td3 import HybridTD3
 from tests.algorithms import LAYOUTS, make_model
-from tests.hybrid_envs import GoalEnv, make_layout_env
+from tests.hybrid_envs import GoalEnv, LayoutEnv, box, make_layout_env
 
 OBS = np.random.default_rng(0).uniform(-1, 1, (20, 2)).astype(np.float32)
 
@@ -105,6 +107,18 @@ def test_set_env(algorithm):
     model.learn(20)
     with pytest.raises(ValueError, match="Action spaces do not match"):
         model.set_env(make_layout_env("flat"))
+
+
+def test_another_order_of_the_actions(algorithm, tmp_path):
+    """Gymnasium calls the spaces equal."""
+    first, second = spaces.Discrete(2), [("run", box(0, 1, 1)), ("hop", box(0, 1, 1))]
+    env, other = (LayoutEnv(spaces.Dict(OrderedDict([("k", first), *parts]))) for parts in (second, reversed(second)))
+    model = make_model(algorithm, env)
+    model.save(tmp_path / "model")
+    for use in (model.set_env, lambda env: algorithm.load(tmp_path / "model", env=env)):
+        with pytest.raises(ValueError, match=r"parts in the model's order, .*run.*hop.*, got .*hop.*run"):
+            use(other)
+    model.set_env(env)
 
 
 def test_hindsight_asks_the_new_environment(off_policy_algorithm):

@@ -25,6 +25,7 @@ from sb3_chdp.common.arguments import (
     SWITCH,
     Accepted,
     check,
+    check_arguments,
     check_load,
     is_class_of,
     is_number,
@@ -34,7 +35,7 @@ from sb3_chdp.common.arguments import (
     optional,
     whole,
 )
-from sb3_chdp.common.checks import check_is_env, check_observation_space, check_policy_kwargs
+from sb3_chdp.common.checks import check_is_env, check_observation_space, check_policy_kwargs, check_same_order
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.masks import env_masks
 from sb3_chdp.common.policies import HybridPolicy
@@ -171,6 +172,11 @@ class HybridAlgorithm(BaseAlgorithm):
         check(one_of(self.policy_aliases), policy=policy_name)
         return super()._get_policy_from_name(policy_name)
 
+    def _check_arguments(self) -> None:
+        if getattr(self, "observation_space", None) is None:
+            raise ValueError("env must be an environment of Gymnasium's, a VecEnv of SB3's, or an id, got None")
+        check_arguments(self)
+
     def _setup_model(self) -> None:
         if self.tensorboard_log is not None:
             self.tensorboard_log = str(self.tensorboard_log)  # a Path would be pickled
@@ -266,6 +272,11 @@ class HybridAlgorithm(BaseAlgorithm):
                 raise
         return total_timesteps, callback
 
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        vec_env = self._wrap_env(env, self.verbose)
+        check_same_order(self.action_space, vec_env.action_space)
+        super().set_env(vec_env, force_reset)
+
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "hybrid_space", "_row_env"]
 
@@ -320,8 +331,11 @@ class HybridAlgorithm(BaseAlgorithm):
         file, objects, version = read_model(cls, path, custom_objects, trusted)
         check_load(cls, path, objects, kwargs)
         try:
-            return super().load(file, env, device, objects, print_system_info, force_reset, **kwargs)
+            model = super().load(file, env, device, objects, print_system_info, force_reset, **kwargs)
         except (AttributeError, LookupError, RuntimeError, TypeError) as error:
             if version == VERSION and not kwargs:
                 raise
             raise misfit(path, version, error, kwargs) from error
+        if model.env is not None:
+            check_same_order(model.action_space, model.env.action_space)
+        return model

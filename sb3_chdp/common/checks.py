@@ -1,20 +1,25 @@
 """Checks of arguments and data, whose errors name what was given and what is accepted."""
 
+import warnings
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from torch import nn
 
 from sb3_chdp.common.arguments import constructor_defaults
-from sb3_chdp.common.space_tree import leaves_of
+from sb3_chdp.common.space_tree import leaves_of, name_of
 
 # What gymnasium.wrappers.FlattenObservation makes a vector of
 FLATTENABLE = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary, spaces.Text, spaces.OneOf)
 # Numbers that are learnt from: a thousand of them add up to 1e18, whose square float32 still holds. Losses and optimizers
 # compute such squares; beyond them they put out infinity, or learn nothing
 LARGEST = 1e15
+# Bytes of actions in a replay buffer that deserve a warning
+LARGE_ROWS = 2**30
 
 
 def check_numbers(name: str, value: Any, first_env: int = 0) -> None:
@@ -44,6 +49,26 @@ def check_numbers(name: str, value: Any, first_env: int = 0) -> None:
         )
 
 
+def check_observation(name: str, space: spaces.Space[Any], value: Any, first_env: int = 0) -> None:
+    """
+    :param name: what the value is, for the message
+    :param space: the observation space
+    :param value: (n, ...) observations of n environments, dict of arrays if the space is one
+    :param first_env: index of the environment that the first is from
+    :raises ValueError: see :func:`check_numbers`, and for a discrete value that is not in the space
+    """
+    if isinstance(space, spaces.Dict):
+        for key, part in space.items():
+            check_observation(f"{name}[{key!r}]", part, value[key], first_env)
+        return
+    check_numbers(name, value, first_env)
+    if isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+        below = space.n if isinstance(space, spaces.Discrete) else space.nvec
+        bad = np.flatnonzero(((value < 0) | (value >= below)).reshape(len(value), -1).any(axis=1))
+        if len(bad):
+            raise ValueError(f"{name} must be in {space}, got {value[bad]} from environment(s) {(first_env + bad).tolist()}")
+
+
 def check_is_env(env: Any) -> None:
     """
     :param env: argument of an algorithm
@@ -53,8 +78,9 @@ def check_is_env(env: Any) -> None:
         raise ValueError(f"env must be an environment, got the class {env.__name__}: give an object of it, {env.__name__}()")
     if isinstance(env, gym.vector.VectorEnv):
         raise ValueError(f"env must be a VecEnv of SB3's, as make_vec_env() returns it, got Gymnasium's {type(env).__name__}")
-    if not hasattr(env, "observation_space"):
-        raise ValueError(f"env must be an environment of Gymnasium's, a VecEnv of SB3's, or an id, got {env!r}")
+    if not isinstance(env, (gym.Env, VecEnv)):
+        remedy = "derive its class from gymnasium.Env"
+        raise ValueError(f"env must be an environment of Gymnasium's, a VecEnv of SB3's, or an id, got {env!r}: {remedy}")
 
 
 def _shapes(space: spaces.Space[Any]) -> Any:
@@ -77,11 +103,29 @@ def check_replayed_observations(env: VecEnv | None) -> None:
         )
 
 
+def check_same_order(space: spaces.Space[Any], of_env: spaces.Space[Any]) -> None:
+    """
+    Dicts that differ by nothing but the order of their keys are equal to Gymnasium.
+
+    :param space: action space of a model
+    :param of_env: that of its environment
+    :raises ValueError: if their parts come in another order
+    """
+    own, other = ([name_of(path) for path, _ in leaves_of(each)] for each in (space, of_env))
+    if space == of_env and own != other:
+        raise ValueError(f"env.action_space must have its parts in the model's order, {own}, got {other}: see OrderedDict")
+
+
 def check_observation_space(space: spaces.Space[Any]) -> None:
     """
     :param space: the observation space of an environment
     :raises ValueError: if SB3's policies cannot read its observations; the message says how they can
     """
+    for key in space if isinstance(space, spaces.Dict) else ():
+        try:
+            nn.ModuleDict({key: nn.Identity()})
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"observation_space has the key {key!r}, which PyTorch takes for no name: rename it") from error
     parts = {f"observation_space[{key!r}]": part for key, part in space.items()} if isinstance(space, spaces.Dict) else None
     for name, part in (parts or {"observation_space": space}).items():
         is_flat = isinstance(part, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary))
@@ -119,3 +163,14 @@ def check_policy_kwargs(policy_class: type, policy_kwargs: dict[str, Any]) -> No
     for name, value in policy_kwargs.items():
         if name.endswith(("_fn", "_class")) and not callable(value):
             raise ValueError(f"policy_kwargs[{name!r}] must be a class, got {value!r}")
+
+
+def warn_of_memory(buffer: ReplayBuffer) -> None:
+    """Warn if the rows of a replay buffer take much memory."""
+    n_bytes = buffer.actions.nbytes
+    if n_bytes > LARGE_ROWS:
+        warnings.warn(
+            f"The actions in the replay buffer will take {n_bytes / 1e9:.1f} GB: {buffer.action_dim} numbers for each of "
+            f"{buffer.buffer_size * buffer.n_envs} transitions, see buffer_size",
+            stacklevel=3,
+        )

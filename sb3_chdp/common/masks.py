@@ -38,6 +38,7 @@ def read_masks(spec: HybridActionSpec, masks: Any, n: int, first: int = 0) -> np
     if array.ndim != 2 or len(array) != n or array.shape[1] not in accepted:
         lengths = " or ".join(map(str, accepted))
         hint = "; action_layout='joint' takes that" if array.ndim == 2 and array.shape[1] == spec.n_discrete_actions else ""
+        hint = "; flatten it, masks.ravel()" if n == 1 and given.size in accepted else hint
         raise ValueError(
             f"action_masks must be {lengths} booleans for each of {n} environment(s), got shape {given.shape}{hint}"
         )
@@ -62,7 +63,10 @@ def allowed_now(env: gym.Env, spec: HybridActionSpec) -> np.ndarray | None:
     """
     if not env.has_wrapper_attr("action_masks"):
         return None
-    return read_masks(spec, env.get_wrapper_attr("action_masks")(), 1)
+    method = env.get_wrapper_attr("action_masks")
+    if not callable(method):
+        raise ValueError(f"action_masks must be a method, got {method!r}")
+    return read_masks(spec, method(), 1)
 
 
 def env_masks(spec: HybridActionSpec, env: VecEnv) -> np.ndarray:
@@ -93,5 +97,8 @@ def last_masks(
     masks = masks.copy()
     for i in np.flatnonzero(dones).tolist():
         given = infos[i].get(INFO_KEY) if infos[i].get("TimeLimit.truncated", False) else None
-        masks[i] = before[i] if given is None else read_masks(spec, given, 1, first=i)[0]
+        try:
+            masks[i] = before[i] if given is None else read_masks(spec, given, 1, first=i)[0]
+        except ValueError as error:
+            raise ValueError(f"info['action_masks'] of an episode's end: {error}") from error
     return masks

@@ -22,7 +22,6 @@ from sb3_chdp.common.arguments import (
     TRAIN_FREQ,
     Accepted,
     check,
-    check_arguments,
     check_device,
     is_class_of,
     optional,
@@ -30,17 +29,15 @@ from sb3_chdp.common.arguments import (
 )
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.buffer_file import check_buffer, load_buffer, save_buffer
-from sb3_chdp.common.checks import check_numbers, check_replayed_observations
+from sb3_chdp.common.checks import check_numbers, check_replayed_observations, warn_of_memory
 from sb3_chdp.common.masks import last_masks
 from sb3_chdp.common.n_step_buffer import TELLS_LAST, n_step_settings
 from sb3_chdp.common.policies import HybridPolicy
+from sb3_chdp.common.row_env import with_original_ends
 from sb3_chdp.common.rows import MASK_PARTS, pack_bits
 from sb3_chdp.common.safe_zip import refuse
 from sb3_chdp.common.samples import HybridReplaySamples, name_columns
 from sb3_chdp.common.trajectories import end_trajectories
-
-# Bytes of actions in a replay buffer that deserve a warning
-LARGE_ROWS = 2**30
 
 SelfHybridOffPolicyAlgorithm = TypeVar("SelfHybridOffPolicyAlgorithm", bound="HybridOffPolicyAlgorithm")
 
@@ -127,7 +124,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         self.use_masking = use_masking
 
     def _setup_model(self) -> None:
-        check_arguments(self)
+        self._check_arguments()
         given = self.replay_buffer_class, self.replay_buffer_kwargs
         try:
             with warnings.catch_warnings():
@@ -149,16 +146,8 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         finally:
             # What follows from other arguments is chosen anew when the model is loaded with other ones
             self.replay_buffer_class, self.replay_buffer_kwargs = given
-        self._warn_of_memory()
-
-    def _warn_of_memory(self) -> None:
         assert self.replay_buffer is not None
-        n_bytes = self.replay_buffer.actions.nbytes
-        if n_bytes > LARGE_ROWS:
-            warnings.warn(
-                f"The actions in the replay buffer will take {n_bytes / 1e9:.1f} GB: {self.replay_buffer.action_dim} numbers "
-                f"for each of buffer_size={self.buffer_size} transitions"
-            )
+        warn_of_memory(self.replay_buffer)
 
     def learn(
         self: SelfHybridOffPolicyAlgorithm,
@@ -281,18 +270,17 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
             return self.policy.random_rows(rng, n_envs, masks)
         explores = rng.random(n_envs) < self._exploration_rate()
         noise = self._draw_noise(n_envs) if action_noise is None else action_noise()
-        if noise is not None and np.size(noise) != n_envs * self.policy.noise_dim:
-            raise ValueError(
-                f"action_noise must have size {self.policy.noise_dim} per environment, got shape {np.shape(noise)} "
-                f"for {n_envs} environment(s)"
-            )
-        if noise is not None:
-            check_numbers("action_noise", np.reshape(noise, (n_envs, -1)))
         obs = self._last_obs
         assert obs is not None, "self._last_obs was not set"
         if noise is None:
             rows = self.policy.predict_rows(obs, action_masks=masks)
         else:
+            if np.size(noise) != n_envs * self.policy.noise_dim:
+                raise ValueError(
+                    f"action_noise must have size {self.policy.noise_dim} per environment, got shape {np.shape(noise)} "
+                    f"for {n_envs} environment(s)"
+                )
+            check_numbers("action_noise", np.reshape(noise, (n_envs, -1)))
             rows = self.policy.noisy_rows(obs, noise, masks)
         if explores.any():
             rows[explores] = self._exploratory_rows(rows, np.flatnonzero(explores), rng, masks)
@@ -329,7 +317,19 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
             columns = self.hybrid_space.columns
             next_masks = last_masks(self.hybrid_space.spec, columns.masks(buffer_action), masks, dones, infos)
             columns.view(buffer_action, "next_masks")[:] = pack_bits(next_masks)
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        normalize = self._vec_normalize_env
+        if normalize is None:
+            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+            return
+        # SB3 would write normalised last observations of episodes into an array of whole numbers, if originals are such
+        original_obs, infos = normalize.get_original_obs(), with_original_ends(normalize, infos)
+        self._last_obs, self._vec_normalize_env = self._last_original_obs, None
+        try:
+            rewards = normalize.get_original_reward()
+            super()._store_transition(replay_buffer, buffer_action, original_obs, rewards, dones, infos)
+        finally:
+            self._vec_normalize_env = normalize
+        self._last_obs, self._last_original_obs = new_obs, original_obs
 
     def _draw_noise(self, n_envs: int) -> np.ndarray | None:
         """:return: (n_envs, noise_dim) noise on what the policy puts out if there is no ``action_noise``; None: no noise"""

@@ -61,6 +61,8 @@ class HybridPolicy(BasePolicy):
         if action_masks is not None:
             n = len(obs_tensor) if isinstance(obs_tensor, th.Tensor) else len(next(iter(obs_tensor.values())))
             action_masks = read_masks(self.action_space.spec, action_masks, n)
+        if len(next(iter(obs_tensor.values())) if isinstance(obs_tensor, dict) else obs_tensor) == 0:
+            return [], state
         actions = self.action_space.to_native(self._rows(obs_tensor, deterministic, action_masks))
         return (actions if vectorized_env else actions[0]), state
 
@@ -101,7 +103,7 @@ class HybridPolicy(BasePolicy):
             )
         obs_tensor, vectorized_env = self.obs_to_tensor(observation)
         tensors = obs_tensor if isinstance(obs_tensor, dict) else {"": obs_tensor}
-        if not all(bool((tensor.abs() <= LARGEST).all()) for tensor in tensors.values() if tensor.is_floating_point()):
+        if not all(bool((tensor.float().abs() <= LARGEST).all()) for tensor in tensors.values() if tensor.is_floating_point()):
             parts = observation if isinstance(observation, dict) else {"": np.asarray(observation)}
             for key, part in parts.items():
                 name = f"observation[{key!r}]" if key else "observation"

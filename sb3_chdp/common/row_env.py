@@ -9,7 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_chdp.common.checks import check_numbers
+from sb3_chdp.common.checks import check_numbers, check_observation
 from sb3_chdp.common.hybrid_box import HybridBox
 
 
@@ -31,6 +31,29 @@ def uncounted_if_refused(normalize: VecNormalize | None) -> Iterator[None]:
         for part, state in zip(parts, before, strict=True):
             vars(part).update(state)
         raise
+
+
+def with_original_ends(normalize: VecNormalize, infos: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """
+    :param normalize: the wrapper
+    :param infos: those of a step
+    :return: the same, with the last observations of episodes as the environment gave them
+    """
+
+    def original(space: spaces.Space[Any], obs: Any) -> Any:
+        if isinstance(space, spaces.Dict):
+            return {key: original(part, obs[key]) for key, part in space.items()}
+        return np.rint(obs).astype(space.dtype) if np.issubdtype(space.dtype, np.integer) else obs
+
+    space = normalize.observation_space
+    return [
+        (
+            {**info, "terminal_observation": original(space, normalize.unnormalize_obs(info["terminal_observation"]))}
+            if info.get("terminal_observation") is not None
+            else info
+        )
+        for info in infos
+    ]
 
 
 class RowVecEnv(VecEnvWrapper):
@@ -78,7 +101,7 @@ class RowVecEnv(VecEnvWrapper):
         :param obs: the latest observations of all environments
         :raises ValueError: if there is one that nothing can be learnt from
         """
-        check_numbers("The observation", obs)
+        check_observation("The observation", self.observation_space, obs)
         if self._normalize is not None:
             check_numbers("The observation before normalization", self._normalize.old_obs)
 
@@ -92,8 +115,8 @@ class RowVecEnv(VecEnvWrapper):
             obs = {key: obs[key] for key in space}
         for key, part in obs.items() if isinstance(obs, dict) else [("", obs)]:
             name = f"The terminal observation[{key!r}]" if key else "The terminal observation"
-            expected = (space[key] if isinstance(space, spaces.Dict) else space).shape
-            if np.shape(part) != expected:
-                raise ValueError(f"{name} must have shape {expected}, got {np.shape(part)} from environment {index}")
-            check_numbers(name, np.asarray(part)[None], index)
+            expected = space[key] if isinstance(space, spaces.Dict) else space
+            if np.shape(part) != expected.shape:
+                raise ValueError(f"{name} must have shape {expected.shape}, got {np.shape(part)} from environment {index}")
+            check_observation(name, expected, np.asarray(part)[None], index)
         return obs

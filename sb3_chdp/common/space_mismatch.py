@@ -44,7 +44,7 @@ def _box_mismatch(space: spaces.Box, value: Any, name: str) -> str | None:
         return f"{name} has the shape {value.shape}, and its space {space.shape}: give both the same"
     if not np.can_cast(value.dtype, space.dtype):
         return f"{name} has dtype {value.dtype}, and its space {space.dtype}: return {as_dtype}, or declare the Box so"
-    if not (np.abs(value) <= LARGEST).all():
+    if not (np.abs(value.astype(np.float64)) <= LARGEST).all():
         remedy = "look for a division by zero or an overflow"
         return f"{name} must be finite, and at most {LARGEST:.0e} in size, got {value}: {remedy}"
     outside = (value < space.low) | (value > space.high)

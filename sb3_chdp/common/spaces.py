@@ -37,8 +37,8 @@ class HybridActionSpec:
     """
     Codec between a user's hybrid action space and rows ``[k | scaled parameters]``.
 
-    Accepted, at any nesting depth and with any ``Dict`` keys (children count in the order of the space, which for a
-    ``Dict`` built from a plain mapping is the sorted order of its keys):
+    Accepted, with any ``Dict`` keys (children count in the order of the space, which for a ``Dict`` built from a plain
+    mapping is the sorted order of its keys), parameters at any nesting depth:
 
     * one box per action: ``Tuple(Discrete(K), Tuple(Box_1, ..., Box_K))``, ``Tuple(Discrete(K), Box_1, ..., Box_K)``,
       ``OneOf((Box_1, ..., Box_K))``. An action without parameters is an empty ``Box``, ``Tuple`` or ``Dict``, or
@@ -77,7 +77,9 @@ class HybridActionSpec:
         elif isinstance(space, (spaces.Tuple, spaces.Dict)):
             choice = find_options(space) if layout in ("auto", "per_action") else None
             if choice is None and layout == "per_action":
-                raise ValueError(f"action_layout='per_action' needs a Discrete(K) and exactly K parameter spaces, got {space}")
+                raise ValueError(
+                    f"action_layout='per_action' needs a Discrete(K) and exactly K parameter spaces at the top, got {space}"
+                )
             self.is_shared = choice is None
             if choice is None:
                 self._discrete_leaves = collect_discrete(space)

@@ -21,7 +21,6 @@ from sb3_chdp.common.arguments import (
     POSITIVE,
     SWITCH,
     Accepted,
-    check_arguments,
     check_device,
     is_class_of,
     number,
@@ -187,7 +186,7 @@ class HPPO(HybridAlgorithm, PPO):
         return ConcatenatedBox(self.action_space, action_layout, ("masks",) if self.use_masking else ())
 
     def _setup_model(self) -> None:
-        check_arguments(self)
+        self._check_arguments()
         hybrid_class = HybridDictRolloutBuffer if isinstance(self.observation_space, spaces.Dict) else HybridRolloutBuffer
         self.rollout_buffer_class = self.rollout_buffer_class or hybrid_class
         if not is_class_of(self.rollout_buffer_class, hybrid_class):
