@@ -17,16 +17,19 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, is_vecenv_wrapped
 
 import sb3_chdp
+from sb3_chdp.common.arguments import constructor_defaults
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.evaluation import evaluate_policy
 from sb3_chdp.common.masks import allowed_now
 from sb3_chdp.common.spaces import HybridActionSpec
 from sb3_chdp.registry import ALGORITHMS
-from sb3_chdp.zoo_arguments import ArgumentsError
+from sb3_chdp.zoo_arguments import ArgumentsError, unknown
 
 # Of random play, at the ends of whose episodes some environments say whether it was a success
 EXAMPLE_STEPS = 1000
 EXAMPLE_EPISODES = 3
+# What rl_zoo3 makes action noise of
+OF_NOISE = ("noise_type", "noise_std")
 FLATTEN = "sb3_chdp.wrappers.FlattenHybridAction"
 TRANSPOSE = "stable_baselines3.common.vec_env.VecTransposeImage"
 
@@ -116,6 +119,14 @@ class HybridExperimentManager(ExperimentManager):
                 of_name = ExperimentManager._preprocess_schedules({"learning_rate": hyperparams[name]})
                 hyperparams[name] = of_name["learning_rate"]
         return ExperimentManager._preprocess_schedules(hyperparams)
+
+    def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> tuple[dict[str, Any], Any, Any, Any]:
+        preprocessed: tuple[dict[str, Any], Any, Any, Any] = super()._preprocess_hyperparams(hyperparams)
+        known = {*constructor_defaults(ALGOS[self.algo]), *OF_NOISE} - {"env", "_init_setup_model"}
+        for name in preprocessed[0]:
+            if name not in known:
+                raise ArgumentsError(unknown("setting", name, known, f"{self.algo} has {', '.join(sorted(known))}"))
+        return preprocessed
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
         wanted = dict.fromkeys([*self.monitor_kwargs.get("info_keywords", ()), "is_success"])

@@ -82,6 +82,14 @@ def test_numbers_that_are_text_to_yaml(tmp_path):
     assert message.endswith("n_timesteps: YAML reads 1e2 as a text, write !!float 1e2\n")
 
 
+def test_settings_that_nobody_has(tmp_path):
+    (tmp_path / "mine.py").write_text(OWN_ENV)
+    arguments = ["train", "--algo", "hppo", "--env", "Own-v0", "--gym-packages", "mine", "-params", "n_setps:5"]
+    message = run(*arguments, cwd=tmp_path, code=1)
+    assert "unknown setting 'n_setps', did you mean n_steps? (hppo has action_layout, batch_size, " in message
+    assert not (tmp_path / "logs").exists()
+
+
 def test_success_that_only_some_infos_have(tmp_path):
     """The monitor insists on what it is told to note."""
     own_env = OWN_ENV.replace("False, False, {}", 'False, False, {"is_success": True} if action[0] else {}')
