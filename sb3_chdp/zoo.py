@@ -139,6 +139,8 @@ class HybridExperimentManager(ExperimentManager):
             raise ArgumentsError(f"{error}; what makes a vector of observations: {remedy}") from error
 
     def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
+        if self.algo not in ALGORITHMS and isinstance(env.observation_space, gym.spaces.Discrete):
+            self.normalize = False  # SB3's off-policy algorithms fail with it
         if self.normalize:
             # Before SB3 transposes images: replay buffers get them from VecNormalize
             env = BaseAlgorithm._wrap_env(env)

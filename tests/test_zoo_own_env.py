@@ -107,14 +107,16 @@ def test_masks_of_joint_actions(tmp_path):
         "-params", "n_steps:5", "batch_size:10", "action_layout:'joint'", cwd=tmp_path)  # fmt: skip
 
 
-def test_observations_that_cannot_be_normalized(tmp_path):
+@pytest.mark.parametrize("algo", ["hppo", "pdqn_td3", "sb3:sac"])
+def test_observations_that_cannot_be_normalized(algo, tmp_path):
     (tmp_path / "mine.py").write_text(
         OWN_ENV.replace("observation_space = Box(-1, 1, (2,))", "observation_space = Discrete(3)").replace(
             "np.zeros(2, np.float32)", "np.int64(1)"
         )
     )
-    run("train", "--algo", "hppo", "--env", "Own-v0", "--gym-packages", "mine", "-n", "20", "--eval-freq", "-1",
-        "-params", "n_steps:5", "batch_size:10", cwd=tmp_path)  # fmt: skip
+    settings = ["n_steps:5"] if algo == "hppo" else ["learning_starts:10", "buffer_size:100"]
+    run("train", "--algo", algo, "--env", "Own-v0", "--gym-packages", "mine", "-n", "20", "--eval-freq", "-1",
+        "-params", *settings, "batch_size:10", cwd=tmp_path)  # fmt: skip
 
 
 CAMERA_ENV = """
