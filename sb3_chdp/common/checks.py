@@ -10,7 +10,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import nn
 
-from sb3_chdp.common.arguments import constructor_defaults
+from sb3_chdp.common.arguments import constructor_defaults, whole
 from sb3_chdp.common.space_tree import leaves_of, name_of
 
 # What gymnasium.wrappers.FlattenObservation makes a vector of
@@ -160,6 +160,10 @@ def check_policy_kwargs(policy_class: type, policy_kwargs: dict[str, Any]) -> No
         raise ValueError(
             f"policy_kwargs has unknown key(s) {sorted(unknown)}; {policy_class.__name__} accepts {sorted(accepted)}"
         )
+    arch = policy_kwargs.get("net_arch") or []
+    for layers in arch.values() if isinstance(arch, dict) else [arch]:
+        if not isinstance(layers, list) or not all(whole(1).test(units) for units in layers):
+            raise ValueError(f"net_arch must be a list of whole numbers, or a dict of such lists, got {arch!r}")
     for name, value in policy_kwargs.items():
         if name.endswith(("_fn", "_class")) and not callable(value):
             raise ValueError(f"policy_kwargs[{name!r}] must be a class, got {value!r}")
