@@ -6,6 +6,7 @@ import sys
 import zipfile
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 
 import sb3_chdp
@@ -64,4 +65,10 @@ def test_example_of_the_readme(capsys):
     names: dict = {}
     exec(code.replace("2_000", "150"), names)
     assert names["Drone"].action_space.contains(names["action"])
+    # As the command line has it; Gymnasium checks more then
+    gym.register("Drone-v0", names["Drone"])
+    env = gym.make("Drone-v0")
+    del gym.registry["Drone-v0"]
+    env.reset()
+    env.step(names["action"])
     assert re.fullmatch(r"success of CHDP \d+% and of SAC on flat actions \d+%\n", capsys.readouterr().out)
