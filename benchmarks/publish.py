@@ -68,7 +68,7 @@ def overview(scores: pd.DataFrame, rows: list[str], envs: list[str], today: pd.D
         best = max((row for row in baselines if (env, row) in means), key=lambda row: means[env, row])
         published = paper.paper_column(chdp, env).split()[0]
         cells = (
-            f"{of_today.mean():.1f}",
+            f"{of_today.mean():.1f}" if len(of_today) else "-",
             len(of_today),
             f"{means[env, chdp]:.1f}",
             f"{means[env, best]:.1f} ({display_name(best)})",

@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import data_equivalence
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_chdp.common.checks import LARGEST, check_observation_space
+from sb3_chdp.common.checks import LARGEST, check_keys, check_observation_space
 from sb3_chdp.common.masks import allowed_now
 from sb3_chdp.common.space_mismatch import mismatch
 from sb3_chdp.common.space_tree import find_options, name_of
@@ -49,6 +49,7 @@ def check_hybrid_env(env: gym.Env, action_layout: str = "auto", warn: bool = Tru
     _check_is_env(env)
     spec = HybridActionSpec(env.action_space, action_layout)
     check_observation_space(env.observation_space)
+    check_keys(env.observation_space)
     player = _Player(env, spec)
     player.play_extremes()
     player.play_episodes()

@@ -13,6 +13,7 @@ from rl_zoo3.utils import ALGOS
 from sb3_contrib.common.maskable.utils import get_action_masks, is_masking_supported
 from stable_baselines3.common import callbacks
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import VecEnv, VecTransposeImage, is_vecenv_wrapped
 
@@ -30,6 +31,8 @@ EXAMPLE_STEPS = 1000
 EXAMPLE_EPISODES = 3
 # What rl_zoo3 makes action noise of
 OF_NOISE = ("noise_type", "noise_std")
+# Arguments that no setting may name: the command line has options for most of them
+OF_COMMAND = {"env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
 FLATTEN = "sb3_chdp.wrappers.FlattenHybridAction"
 TRANSPOSE = "stable_baselines3.common.vec_env.VecTransposeImage"
 
@@ -91,15 +94,17 @@ class HybridExperimentManager(ExperimentManager):
             settings.setdefault("policy", "MlpPolicy")
             settings.setdefault("n_timesteps", self.n_timesteps)
         for name, value in hyperparams.items():
-            if isinstance(value, str) and _is_number(value):
-                raise ArgumentsError(f"{name}: YAML reads {value} as a text, write !!float {value}")
+            # SB3 reads ent_coef itself
+            if isinstance(value, str) and _is_number(value) and name != "ent_coef":
+                raise ArgumentsError(f"{name}: {value} is a text, not a number; in YAML write !!float {value}")
         if hyperparams["n_timesteps"] <= 0:
             raise ArgumentsError(f"-n says for how many steps: the file {self.config} does not")
         if hyperparams.get("env_kwargs") and not self.env_kwargs:
             # Those of the YAML file are for evaluation too
             self.env_kwargs = hyperparams["env_kwargs"]
             self.eval_env_kwargs = self._eval_env_kwargs_args or self.env_kwargs
-        self._layout: str = hyperparams.get("action_layout", "auto")
+        # A wrapper may change the action space
+        self._layout: str = "auto" if hyperparams.get("env_wrapper") else hyperparams.get("action_layout", "auto")
         if self.algo not in ALGORITHMS and isinstance(self._example[0], HYBRID_SPACES):
             for settings in (hyperparams, saved):
                 _flatten(settings)
@@ -122,7 +127,7 @@ class HybridExperimentManager(ExperimentManager):
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> tuple[dict[str, Any], Any, Any, Any]:
         preprocessed: tuple[dict[str, Any], Any, Any, Any] = super()._preprocess_hyperparams(hyperparams)
-        known = {*constructor_defaults(ALGOS[self.algo]), *OF_NOISE} - {"env", "_init_setup_model"}
+        known = {*constructor_defaults(ALGOS[self.algo]), *OF_NOISE} - OF_COMMAND
         for name in preprocessed[0]:
             if name not in known:
                 raise ArgumentsError(unknown("setting", name, known, f"{self.algo} has {', '.join(sorted(known))}"))
@@ -139,8 +144,9 @@ class HybridExperimentManager(ExperimentManager):
             raise ArgumentsError(f"{error}; what makes a vector of observations: {remedy}") from error
 
     def _maybe_normalize(self, env: VecEnv, eval_env: bool) -> VecEnv:
-        if self.algo not in ALGORITHMS and isinstance(env.observation_space, gym.spaces.Discrete):
-            self.normalize = False  # SB3's off-policy algorithms fail with it
+        is_stock = self.algo not in ALGORITHMS and issubclass(ALGOS[self.algo], OffPolicyAlgorithm)
+        if is_stock and isinstance(env.observation_space, gym.spaces.Discrete):
+            self.normalize = False  # they fail with it
         if self.normalize:
             # Before SB3 transposes images: replay buffers get them from VecNormalize
             env = BaseAlgorithm._wrap_env(env)
@@ -151,6 +157,8 @@ class HybridExperimentManager(ExperimentManager):
         self, hyperparams: dict[str, Any], saved_hyperparams: dict[str, Any], env: VecEnv
     ) -> dict[str, Any]:
         # The first method that gets both the environment and the arguments, those that enjoy will read among them
+        if not self.normalize:
+            saved_hyperparams.pop("normalize", None)
         if self.normalize and is_vecenv_wrapped(env, VecTransposeImage):
             _add_wrapper(saved_hyperparams, "vec_env_wrapper", TRANSPOSE)
         if hyperparams.get("policy") == "MlpPolicy" and "policy" not in (self.custom_hyperparams or {}):

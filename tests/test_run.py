@@ -296,10 +296,11 @@ def test_policies_that_do_not_fit(algorithm):
         make_model(algorithm, make_layout_env(), policy_kwargs=[1])
 
 
-@pytest.mark.parametrize("arch", [(8, 8), 8, [8, "8"], dict(pi=[8], qf=8)], ids=str)
+@pytest.mark.parametrize("arch", [8, [8, "8"], dict(pi=[8], qf=8)], ids=str)
 def test_networks_that_are_none(algorithm, arch):
     with pytest.raises(ValueError, match=r"net_arch must be a list of whole numbers, or a dict of such lists, got "):
         make_model(algorithm, make_layout_env(), policy_kwargs=dict(net_arch=arch))
+    make_model(algorithm, make_layout_env(), policy_kwargs=dict(net_arch=(8, 8)))
 
 
 def test_network_of_a_wrong_name():

@@ -197,7 +197,13 @@ def test_row_out_of_range():
 
 
 @pytest.mark.parametrize(
-    "layout, action", [("shared", (3, np.zeros(2, np.float32))), ("one_of", (-1, np.zeros(1, np.float32))), ("product", None)]
+    "layout, action",
+    [
+        ("shared", (3, [0, 0])),
+        ("shared", (0, [0, 9])),
+        ("one_of", (-1, [0.0])),
+        ("product", {"a": [2, 0], "b": [0], "x": [0]}),
+    ],
 )
 def test_actions_that_are_not_in_the_space(layout, action):
     with pytest.raises(ValueError, match=r"action must be in .*, got"):

@@ -79,7 +79,7 @@ def test_numbers_that_are_text_to_yaml(tmp_path):
     (tmp_path / "mine.yml").write_text("Own-v0: {n_steps: 5, batch_size: 10, n_timesteps: 1e2}")
     arguments = ["train", "--algo", "hppo", "--env", "Own-v0", "--gym-packages", "mine", "-conf", "mine.yml"]
     message = run(*arguments, cwd=tmp_path, code=1)
-    assert message.endswith("n_timesteps: YAML reads 1e2 as a text, write !!float 1e2\n")
+    assert message.endswith("n_timesteps: 1e2 is a text, not a number; in YAML write !!float 1e2\n")
 
 
 def test_settings_that_nobody_has(tmp_path):

@@ -51,7 +51,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--jobs", type=int, help="runs at a time (default: 1, with Slurm as many as it allows)")
     add("-params", "--hyperparams", nargs="+", action=StoreDict, default={}, help="override hyperparameters, as in train")
     add("--conf-folder", help="folder with YAML files of your own, <algorithm>.yml, for the algorithms that have one there")
-    add("--eval-episodes", type=int, help="episodes of each of the 30 evaluations of a run (default: 20, of the paper's 100)")
+    add("--eval-episodes", type=int, help="episodes of each of the 30 evaluations of a run (default: 20; 100 with paper)")
     add("--checkpoint-interval", type=float, default=180, metavar="SECONDS", help="between two checkpoints (default: 180)")
     add("--restart", action="store_true", help="train anew the runs that were started with other settings")
     add("--cluster", choices=jobs.CLUSTERS, default="local", help="processes of this machine, or jobs of Slurm")

@@ -13,6 +13,7 @@ from sb3_contrib.common.maskable.utils import is_masking_supported
 from stable_baselines3.common.base_class import BaseAlgorithm, maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.common.vec_env import VecCheckNan, VecEnv, is_vecenv_wrapped
@@ -35,7 +36,7 @@ from sb3_chdp.common.arguments import (
     optional,
     whole,
 )
-from sb3_chdp.common.checks import check_is_env, check_observation_space, check_policy_kwargs, check_same_order
+from sb3_chdp.common.checks import check_is_env, check_keys, check_observation_space, check_policy_kwargs, check_same_order
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.masks import env_masks
 from sb3_chdp.common.policies import HybridPolicy
@@ -172,10 +173,13 @@ class HybridAlgorithm(BaseAlgorithm):
         check(one_of(self.policy_aliases), policy=policy_name)
         return super()._get_policy_from_name(policy_name)
 
-    def _check_arguments(self) -> None:
+    def _settle_arguments(self) -> None:
+        """Check the arguments, and ask the environment what they leave open. The first thing that ``_setup_model`` does."""
         if getattr(self, "observation_space", None) is None:
             raise ValueError("env must be an environment of Gymnasium's, a VecEnv of SB3's, or an id, got None")
         check_arguments(self)
+        if self.use_masking is None and self.env is not None and is_masking_supported(self.env):
+            self.use_masking = True
 
     def _setup_model(self) -> None:
         if self.tensorboard_log is not None:
@@ -190,16 +194,18 @@ class HybridAlgorithm(BaseAlgorithm):
                 f"{self.policy_class.__name__}, which takes a Dict of them"
             )
         check_policy_kwargs(self.policy_class, self.policy_kwargs)
+        if is_class_of(self.policy_kwargs.get("features_extractor_class", CombinedExtractor), CombinedExtractor):
+            check_keys(self.observation_space)
         of_algorithm = self._network_kwargs()
         for name in self.policy_kwargs.keys() & of_algorithm.keys():
             raise ValueError(f"policy_kwargs must not have {name!r}: it is an argument of {type(self).__name__} itself")
-        if self.use_masking is None and self.env is not None and is_masking_supported(self.env):
-            self.use_masking = True
         native_space, policy_kwargs = self.action_space, self.policy_kwargs
         self.hybrid_space = self._choose_hybrid_space()
         # Buffer and policy are built for the rows; the model keeps the user's space
         self.action_space = self.hybrid_space
         self.policy_kwargs = {**policy_kwargs, **of_algorithm}
+        if isinstance(policy_kwargs.get("net_arch"), tuple):
+            self.policy_kwargs["net_arch"] = [*policy_kwargs["net_arch"]]
         try:
             super()._setup_model()  # type: ignore[safe-super]  # of the SB3 algorithm that follows in the MRO
         finally:

@@ -83,11 +83,15 @@ def check_buffer(path: PathOrFile, buffer: Any, own: Any) -> None:
 
     def content(of: Any) -> dict[str, Any]:
         names = ("observation_space", "action_space", "n_envs", "n_steps", "gamma")
-        return {"class": type(of).__name__, **{name: getattr(of, name) for name in names if hasattr(of, name)}}
+        state_parts = getattr(of.action_space, "state_parts", ())
+        values = {name: getattr(of, name) for name in names if hasattr(of, name)}
+        return {"class": type(of).__name__, "state_parts": state_parts, **values}
 
     found, expected = content(buffer), content(own)
     for name, value in expected.items():
         if found.get(name) != value:
+            remedy = {"state_parts": "see use_masking", "gamma": "see replay_buffer_kwargs"}.get(name)
             raise ValueError(
                 f"{path} must hold a replay buffer like that of the model, with {name} {value}, got {found.get(name)}"
+                f"{f'; {remedy}' if remedy else ''}"
             )

@@ -1,6 +1,7 @@
 """Checks of arguments and data, whose errors name what was given and what is accepted."""
 
 import warnings
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium as gym
@@ -78,8 +79,10 @@ def check_is_env(env: Any) -> None:
         raise ValueError(f"env must be an environment, got the class {env.__name__}: give an object of it, {env.__name__}()")
     if isinstance(env, gym.vector.VectorEnv):
         raise ValueError(f"env must be a VecEnv of SB3's, as make_vec_env() returns it, got Gymnasium's {type(env).__name__}")
-    if not isinstance(env, (gym.Env, VecEnv)):
-        remedy = "derive its class from gymnasium.Env"
+    # SB3 converts environments of the old gym, where that is installed
+    is_env = isinstance(env, (gym.Env, VecEnv)) or find_spec("gym") is not None
+    if not is_env or not hasattr(env, "observation_space"):
+        remedy = "derive its class from gymnasium.Env, and set observation_space"
         raise ValueError(f"env must be an environment of Gymnasium's, a VecEnv of SB3's, or an id, got {env!r}: {remedy}")
 
 
@@ -121,11 +124,6 @@ def check_observation_space(space: spaces.Space[Any]) -> None:
     :param space: the observation space of an environment
     :raises ValueError: if SB3's policies cannot read its observations; the message says how they can
     """
-    for key in space if isinstance(space, spaces.Dict) else ():
-        try:
-            nn.ModuleDict({key: nn.Identity()})
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"observation_space has the key {key!r}, which PyTorch takes for no name: rename it") from error
     parts = {f"observation_space[{key!r}]": part for key, part in space.items()} if isinstance(space, spaces.Dict) else None
     for name, part in (parts or {"observation_space": space}).items():
         is_flat = isinstance(part, (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary))
@@ -148,6 +146,18 @@ def check_observation_space(space: spaces.Space[Any]) -> None:
         )
 
 
+def check_keys(space: spaces.Space[Any]) -> None:
+    """
+    :param space: observation space, of whose parts SB3's ``CombinedExtractor`` makes a network each
+    :raises ValueError: for a key that PyTorch does not take as a name of a network
+    """
+    for key in space if isinstance(space, spaces.Dict) else ():
+        try:
+            nn.ModuleDict({key: nn.Identity()})
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"observation_space has the key {key!r}, which PyTorch takes for no name: rename it") from error
+
+
 def check_policy_kwargs(policy_class: type, policy_kwargs: dict[str, Any]) -> None:
     """
     :raises ValueError: if the policy has no such argument, where the message lists those it has, and for the name of a class
@@ -162,7 +172,7 @@ def check_policy_kwargs(policy_class: type, policy_kwargs: dict[str, Any]) -> No
         )
     arch = policy_kwargs.get("net_arch") or []
     for layers in arch.values() if isinstance(arch, dict) else [arch]:
-        if not isinstance(layers, list) or not all(whole(1).test(units) for units in layers):
+        if not isinstance(layers, (list, tuple)) or not all(whole(1).test(units) for units in layers):
             raise ValueError(f"net_arch must be a list of whole numbers, or a dict of such lists, got {arch!r}")
     for name, value in policy_kwargs.items():
         if name.endswith(("_fn", "_class")) and not callable(value):

@@ -7,7 +7,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_chdp.common.arguments import Accepted, is_class_of
+from sb3_chdp.common.arguments import Accepted, constructor_defaults, is_class_of
 from sb3_chdp.common.hybrid_box import HybridBox
 
 
@@ -61,6 +61,8 @@ def n_step_settings(
     """
     if kind is NStepReplayBuffer or (kind is None and n_steps > 1 and not has_dicts):
         kind = HybridNStepReplayBuffer
-    if is_class_of(kind, NStepReplayBuffer):
-        kwargs = {"gamma": gamma, **({"n_steps": n_steps} if n_steps > 1 else {}), **kwargs}
+    if kind is not None and issubclass(kind, NStepReplayBuffer):
+        of_algorithm = {"gamma": gamma, **({"n_steps": n_steps} if n_steps > 1 else {})}
+        taken = constructor_defaults(kind)
+        kwargs = {**{name: value for name, value in of_algorithm.items() if name in taken}, **kwargs}
     return kind, dict(kwargs)

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -63,7 +63,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         "policy_delay": whole(1),
         "action_noise": optional(Accepted("an ActionNoise of SB3's", lambda value: isinstance(value, ActionNoise))),
         "replay_buffer_class": optional(Accepted("a class of replay buffers", lambda value: is_class_of(value, ReplayBuffer))),
-        "replay_buffer_kwargs": Accepted("a dict, or None", lambda value: isinstance(value, dict)),
+        "replay_buffer_kwargs": optional(Accepted("a dict", lambda value: isinstance(value, dict))),
     }
     policy: HybridPolicy
 
@@ -124,16 +124,15 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         self.use_masking = use_masking
 
     def _setup_model(self) -> None:
-        self._check_arguments()
+        self._settle_arguments()
         given = self.replay_buffer_class, self.replay_buffer_kwargs
         try:
             with warnings.catch_warnings():
-                if self.replay_buffer_class is None:
-                    # SB3's, that n_steps does not count, is wrong here
-                    warnings.filterwarnings("ignore", message="`n_steps=")
                 has_dicts = isinstance(self.observation_space, spaces.Dict)
-                settings = n_step_settings(*given, self.n_steps, self.gamma, has_dicts)
+                settings = n_step_settings(given[0], given[1] or {}, self.n_steps, self.gamma, has_dicts)
                 self.replay_buffer_class, self.replay_buffer_kwargs = settings
+                if is_class_of(self.replay_buffer_class, NStepReplayBuffer):
+                    warnings.filterwarnings("ignore", message="`n_steps=")  # that it does not count
                 if self._state_parts():
                     check(TELLS_LAST, replay_buffer_class=self.replay_buffer_class)
                 super()._setup_model()

@@ -200,6 +200,7 @@ class ResumableCheckpoint(BaseCallback):
         state = {
             "class": f"{type(model).__module__}.{type(model).__qualname__}",
             "n_envs": model.n_envs,
+            "use_masking": bool(getattr(model, "use_masking", False)),
             "vec_wrappers": class_names(self.training_env),
             "model": model_state(model),
             "env": save_env(self.training_env),
@@ -268,6 +269,7 @@ def resume(
         raise ValueError(f"env must be wrapped in {state['vec_wrappers']} like the checkpoint, got {class_names(vec_env)}")
     if "trusted" in inspect.signature(algorithm.load).parameters:
         kwargs["trusted"] = trusted
+        kwargs.setdefault("use_masking", state.get("use_masking"))
     model = algorithm.load(folder / "model.zip", env=vec_env, device=device, force_reset=False, **kwargs)
     restore_model(model, state["model"])
     buffer = _replay_buffer(model)

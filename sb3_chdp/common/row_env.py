@@ -40,15 +40,16 @@ def with_original_ends(normalize: VecNormalize, infos: list[dict[str, Any]]) -> 
     :return: the same, with the last observations of episodes as the environment gave them
     """
 
-    def original(space: spaces.Space[Any], obs: Any) -> Any:
-        if isinstance(space, spaces.Dict):
-            return {key: original(part, obs[key]) for key, part in space.items()}
-        return np.rint(obs).astype(space.dtype) if np.issubdtype(space.dtype, np.integer) else obs
+    def original(like: Any, obs: Any) -> Any:
+        if isinstance(like, dict):
+            return {key: original(part, obs[key]) for key, part in like.items()}
+        return np.rint(obs).astype(like.dtype) if np.issubdtype(like.dtype, np.integer) else obs
 
-    space = normalize.observation_space
+    # Of images the space says float32
+    like = normalize.old_obs
     return [
         (
-            {**info, "terminal_observation": original(space, normalize.unnormalize_obs(info["terminal_observation"]))}
+            {**info, "terminal_observation": original(like, normalize.unnormalize_obs(info["terminal_observation"]))}
             if info.get("terminal_observation") is not None
             else info
         )

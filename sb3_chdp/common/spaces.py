@@ -30,6 +30,8 @@ from sb3_chdp.common.space_tree import (
 MAX_DISCRETE_ACTIONS = 65_536
 # More joint discrete actions than these, too many to compare all of them, are factored unless the layout says otherwise
 FACTORED_ABOVE = 64
+# Of scaled parameters
+ROUNDING = 1e-3
 LAYOUTS = ("auto", "per_action", "shared", "joint", "factored")
 
 
@@ -274,24 +276,27 @@ class HybridActionSpec:
 
         :param action: a native action
         :return: (columns.width,) float64 ``[k | scaled parameters]``, padding 0
-        :raises ValueError: if the action is not in the space
+        :raises ValueError: for a discrete value or a parameter outside of its range
         """
-        if not self.space.contains(action):
-            raise ValueError(f"action must be in {self.space}, got {action!r}")
+        given, digits = action, self.digits
         if isinstance(self.space, spaces.OneOf):
-            k = np.array([int(action[0])])
+            k, digits = np.array([int(action[0])]), (self.n_discrete_actions,)
             action = {"option": action[1]}
         else:
             k = np.concatenate([np.ravel(get_part(action, leaf.path)) - leaf.start for leaf in self._discrete_leaves])
             k = k.astype(np.int64)
-            if not self.is_factored:
-                k = np.array([np.ravel_multi_index(tuple(k), self.digits)])
+        if not ((k >= 0) & (k < digits)).all():
+            raise ValueError(f"action must be in {self.space}, got {given!r}")
+        if not self.is_factored:
+            k = np.array([np.ravel_multi_index(tuple(k), digits)])
         option = 0 if self.is_shared else int(k[0])
         parameters = np.zeros(self.max_parameters)
         for box in self._boxes[option]:
             values = np.ravel(get_part(action, box.path)).astype(np.float64) - self.centre[option, box.columns]
             half = self.half_range[option, box.columns]
             parameters[box.columns] = np.divide(values, half, out=np.zeros_like(values), where=half > 0)
+        if not (np.abs(parameters) <= 1 + ROUNDING).all():
+            raise ValueError(f"action must be in {self.space}, got {given!r}")
         return self.columns.pack(discrete_actions=k[None], parameters=parameters[None])[0]
 
     def sample_choices(self, rng: np.random.Generator, n: int, masks: np.ndarray | None = None) -> np.ndarray:

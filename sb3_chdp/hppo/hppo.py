@@ -186,7 +186,7 @@ class HPPO(HybridAlgorithm, PPO):
         return ConcatenatedBox(self.action_space, action_layout, ("masks",) if self.use_masking else ())
 
     def _setup_model(self) -> None:
-        self._check_arguments()
+        self._settle_arguments()
         hybrid_class = HybridDictRolloutBuffer if isinstance(self.observation_space, spaces.Dict) else HybridRolloutBuffer
         self.rollout_buffer_class = self.rollout_buffer_class or hybrid_class
         if not is_class_of(self.rollout_buffer_class, hybrid_class):
