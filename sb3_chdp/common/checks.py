@@ -185,6 +185,6 @@ def warn_of_memory(buffer: ReplayBuffer) -> None:
     if n_bytes > LARGE_ROWS:
         warnings.warn(
             f"The actions in the replay buffer will take {n_bytes / 1e9:.1f} GB: {buffer.action_dim} numbers for each of "
-            f"{buffer.buffer_size * buffer.n_envs} transitions, see buffer_size",
+            f"buffer_size={buffer.buffer_size * buffer.n_envs} transitions",
             stacklevel=3,
         )
