@@ -310,7 +310,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """SB3's, with the masks of the next states."""
+        """SB3's, with the masks of the next states, and last observations that ``VecNormalize`` has not rounded."""
         masks = self._action_masks()
         if masks is not None:
             columns = self.hybrid_space.columns
