@@ -155,14 +155,16 @@ def test_stored_parameters_value_the_latents_of_the_paper():
 
 
 def test_soft_quantization():
-    """Near codewords weigh more, and none is too far to be seen from another one."""
-    codewords = th.tensor([[[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]]])
+    """Near codewords weigh more, those that do not compete nothing, and none is too far to be seen from another one."""
+    codewords = th.tensor([[[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [1.0, 1.0]]])
     latents = th.tensor([[0.9, 1.0]], requires_grad=True)
-    weights = losses.soft_quantization(latents, codewords)
-    assert weights[0, 0] > weights[0, 1] > weights[0, 2] > 0.05
+    competes = losses.first_occurrences(th.tensor([[2, 1, 0, 2]]))
+    assert competes.tolist() == [[True, True, True, False]]
+    weights = losses.soft_quantization(latents, codewords, competes)
+    assert weights[0, 0] > weights[0, 1] > weights[0, 2] > 0.05 and weights[0, 3] == 0
     assert weights.sum().item() == pytest.approx(1)
     # What is worth more draws the latent towards it
-    values = th.tensor([[0.0, 0.0, 1.0]])
+    values = th.tensor([[0.0, 0.0, 1.0, 0.0]])
     (gradient,) = th.autograd.grad((weights * values).sum(), latents)
     assert (gradient < 0).all()
 
@@ -186,6 +188,11 @@ def test_forbidden_actions_do_not_compete():
     )
     masked_then, free_then = q_losses()
     assert masked_then == masked and free_then < free - 1
+
+
+def test_equal_actions_of_a_factored_space_compete_once():
+    k = th.tensor([[[0, 1], [1, 1], [0, 1]]])
+    assert losses.first_occurrences(k).tolist() == [[True, True, False]]
 
 
 def test_the_discrete_policy_learns_which_action_is_best():

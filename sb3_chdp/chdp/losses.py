@@ -6,6 +6,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.samples import HybridReplaySamples
 
+# A worse discrete action counts as worse by no more than this, in the critics' units
+LARGEST_LOSS = 0.3
 # Discrete actions beside the drawn and the stored one by whose values the discrete policy is improved
 N_COMPARED = 2
 
@@ -111,17 +113,28 @@ def return_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, features: 
     return (replay_data.weights * (summands - errors).square()).mean()
 
 
-def soft_quantization(latents: th.Tensor, codewords: th.Tensor) -> th.Tensor:
+def first_occurrences(k: th.Tensor) -> th.Tensor:
+    """
+    :param k: (B, n) discrete actions, (B, n, L) of a factored space
+    :return: (B, n) False for those that stand further left already
+    """
+    k = k.flatten(1).unflatten(1, (k.shape[1], -1))
+    same = (k[:, :, None] == k[:, None]).all(dim=3)
+    return ~same.tril(-1).any(dim=2)
+
+
+def soft_quantization(latents: th.Tensor, codewords: th.Tensor, competes: th.Tensor) -> th.Tensor:
     """
     Weights softmax(-||e - e_j||^2 / tau) of codewords, tau the mean of these distances (as in Agustsson et al., 2017).
 
     :param latents: (B, latent_dim) latents e, to which the weights have a gradient
     :param codewords: (B, n, latent_dim) codewords e_j
+    :param competes: (B, n) False for codewords of weight 0
     :return: (B, n) weights, their sum is 1
     """
     distances = (latents[:, None] - codewords).square().sum(dim=2)
     tau = distances.detach().mean(dim=1, keepdim=True).clamp(min=1e-6)
-    return (-distances / tau).softmax(dim=1)
+    return (-distances / tau).masked_fill(~competes, -th.inf).softmax(dim=1)
 
 
 def discrete_policy_loss(
@@ -130,15 +143,17 @@ def discrete_policy_loss(
     """
     Eq. 7, L_d - alpha Q1(s, e, a), with Q1 of a soft quantisation of the latents e drawn through the whole chain.
 
-    How Q1 changes around one codeword does not tell where a better one is. So the nearest codeword competes with the best of
-    that of the stored action and ``N_COMPARED`` others, each valued with parameters that the continuous policy draws for it.
-    Q1 is the mean of these two with the weights of :func:`soft_quantization`: latents move towards what is worth more. Were
-    bad ones part of the mean, they would drive latents away from the good ones near them as well.
+    How Q1 changes around one codeword does not tell where a better one is. So the nearest codeword competes with that of the
+    stored action and ``N_COMPARED`` others, each valued with parameters that the continuous policy draws for it, and Q1 is
+    their mean with the weights of :func:`soft_quantization`: latents move towards what is worth more.
+
+    Bad codewords would drive latents away from good ones near them. So if others are worth more than the nearest, the best of
+    them alone competes with it, and how much less others are worth counts up to ``LARGEST_LOSS``.
 
     :param policy: the networks
     :param replay_data: a batch
     :param features: (B, features_dim) features of the observations, without gradient
-    :return: diffusion loss L_d and policy improvement loss -Q1
+    :return: diffusion loss L_d and policy improvement loss, minus what Q1 exceeds that of the nearest codeword
     """
     actor, codebook = policy.actor, policy.actor.codebook
     latents, nearest = actor.draw_latents(features, masks=replay_data.masks)
@@ -150,16 +165,16 @@ def discrete_policy_loss(
         repeated = features.repeat_interleave(n, dim=0)
         parameters = actor.sample_parameters(repeated, k.flatten(0, 1))
         values = policy.critic.score1(repeated, codewords.flatten(0, 1), parameters).view(-1, n)
-        # If none differs from the nearest, it competes with itself
-        excluded = (k == k[:, :1]).reshape(*k.shape[:2], -1).all(dim=2)
+        gains = (values - values[:, :1]).clamp(min=-LARGEST_LOSS)
+        # An action that is there twice competes once
+        competes = first_occurrences(k)
         if replay_data.masks is not None:
-            excluded |= ~codebook.allowed(k, replay_data.masks)
-        best = values.masked_fill(excluded, -th.inf).argmax(dim=1, keepdim=True)
-        pair = th.cat([th.zeros_like(best), best], dim=1)
-        values, codewords = values.gather(1, pair), codewords.take_along_dim(pair[:, :, None], dim=1)
-    weights = soft_quantization(latents, codewords)
+            competes &= codebook.allowed(k, replay_data.masks)
+        most = gains.masked_fill(~competes, -th.inf).amax(dim=1, keepdim=True)
+        competes &= (most == 0) | (gains == most) | (gains == 0)
+    weights = soft_quantization(latents, codewords, competes)
     diffusion_loss = actor.discrete_policy.diffusion_loss(replay_data.latents, features)
-    return diffusion_loss, -(weights * values).sum(dim=1).mean()
+    return diffusion_loss, -(weights * gains).sum(dim=1).mean()
 
 
 def continuous_policy_loss(
