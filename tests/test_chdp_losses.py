@@ -220,6 +220,26 @@ def test_the_discrete_policy_learns_which_action_is_best():
     assert share_of_best([0.9, 1.2, -1.5]) > 0.9
 
 
+def test_how_bad_worse_actions_are_does_not_count(monkeypatch):
+    """Beyond a bound."""
+    model = filled_model()
+    data, actor = sample(model), model.actor
+    features = model.critic.features(data.observations).detach()
+    codewords = actor.codebook.codewords.detach()
+    nearest = th.zeros(len(features), dtype=th.long)
+    monkeypatch.setattr(actor, "draw_latents", lambda *_, **__: (codewords[nearest], nearest))
+
+    def q_loss(*values):
+        of_latents = th.tensor(values)[:, None]
+        monkeypatch.setattr(
+            model.critic, "score1", lambda _, latents, *__: (latents[:, None] == codewords).all(dim=2).float() @ of_latents
+        )
+        th.manual_seed(0)
+        return losses.discrete_policy_loss(model.policy, data, features)[1].item()
+
+    assert q_loss(0.0, -1.0, -2.0) == pytest.approx(q_loss(0.0, -10.0, -20.0)) != pytest.approx(q_loss(0.0, -0.1, -0.2))
+
+
 def next_q_values(policy, features):
     """min Q' of the next action that the online critics select, of CHDP beside a share of that of a random one."""
     actor, critic = policy.actor_target, policy.critic_target

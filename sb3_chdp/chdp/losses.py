@@ -170,6 +170,7 @@ def discrete_policy_loss(
         competes = first_occurrences(k)
         if replay_data.masks is not None:
             competes &= codebook.allowed(k, replay_data.masks)
+        # All if the nearest is the best, else the nearest and the best alone
         most = gains.masked_fill(~competes, -th.inf).amax(dim=1, keepdim=True)
         competes &= (most == 0) | (gains == most) | (gains == 0)
     weights = soft_quantization(latents, codewords, competes)
