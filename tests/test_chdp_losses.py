@@ -237,7 +237,9 @@ def test_how_bad_worse_actions_are_does_not_count(monkeypatch):
         th.manual_seed(0)
         return losses.discrete_policy_loss(model.policy, data, features)[1].item()
 
-    assert q_loss(0.0, -1.0, -2.0) == pytest.approx(q_loss(0.0, -10.0, -20.0)) != pytest.approx(q_loss(0.0, -0.1, -0.2))
+    bad = q_loss(0.0, -1.0, -2.0)
+    assert bad == pytest.approx(q_loss(0.0, -10.0, -20.0))
+    assert bad != pytest.approx(q_loss(0.0, -0.1, -0.2))
 
 
 def next_q_values(policy, features):

@@ -7,7 +7,7 @@ from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.samples import HybridReplaySamples
 
 # A worse discrete action counts as worse by no more than this, in the critics' units
-LARGEST_LOSS = 0.3
+LARGEST_DEFICIT = 0.3
 # Discrete actions beside the drawn and the stored one by whose values the discrete policy is improved
 N_COMPARED = 2
 
@@ -147,8 +147,8 @@ def discrete_policy_loss(
     stored action and ``N_COMPARED`` others, each valued with parameters that the continuous policy draws for it, and Q1 is
     their mean with the weights of :func:`soft_quantization`: latents move towards what is worth more.
 
-    Bad codewords would drive latents away from good ones near them. So if others are worth more than the nearest, the best of
-    them alone competes with it, and how much less others are worth counts up to ``LARGEST_LOSS``.
+    Bad codewords would drive latents away from good ones near them. So a codeword counts as worse than the nearest by at most
+    ``LARGEST_DEFICIT``, and if one is better than the nearest, the best alone competes with it.
 
     :param policy: the networks
     :param replay_data: a batch
@@ -165,7 +165,7 @@ def discrete_policy_loss(
         repeated = features.repeat_interleave(n, dim=0)
         parameters = actor.sample_parameters(repeated, k.flatten(0, 1))
         values = policy.critic.score1(repeated, codewords.flatten(0, 1), parameters).view(-1, n)
-        gains = (values - values[:, :1]).clamp(min=-LARGEST_LOSS)
+        gains = (values - values[:, :1]).clamp(min=-LARGEST_DEFICIT)
         # An action that is there twice competes once
         competes = first_occurrences(k)
         if replay_data.masks is not None:
