@@ -1,8 +1,11 @@
 """What the critics of CHDP see, and what they can fit for it."""
 
+import pytest
 import torch as th
 
+from sb3_chdp.chdp.codebook import Codebook
 from sb3_chdp.chdp.critic import AttentionReads, QNetwork
+from sb3_chdp.chdp.product_codebook import ProductCodebook
 from tests.fitting import unexplained
 
 N_FEATURES, LATENT_DIM = 6, 32
@@ -10,7 +13,7 @@ N_FEATURES, LATENT_DIM = 6, 32
 
 def make_q_network(n_reads=4, n_features=N_FEATURES, latent_dim=LATENT_DIM, n_parameters=1):
     th.manual_seed(0)
-    return QNetwork(n_features, latent_dim, n_parameters, [64, 64], th.nn.SiLU, n_reads)
+    return QNetwork(n_features, th.full((latent_dim,), latent_dim), n_parameters, [64, 64], th.nn.SiLU, n_reads)
 
 
 def test_values_are_bounded():
@@ -68,3 +71,12 @@ def test_rescaled_values():
     before = q_network(*inputs)
     q_network.rescale(th.tensor(0.01), th.tensor(5.0))
     th.testing.assert_close(q_network(*inputs), 0.01 * before + 5)
+
+
+def test_wide_codewords_do_not_outweigh_features():
+    """What A sees of the codeword of a choice is no longer than 2, and narrow codewords are left alone."""
+    codebooks = Codebook(3, LATENT_DIM), ProductCodebook((2, 3, 40), LATENT_DIM)
+    for codebook, norms in zip(codebooks, ([2.0], [1.0, 2**0.5, 2.0]), strict=True):
+        network = QNetwork(1, codebook.latent_widths(), 1, [8], th.nn.SiLU, 1)
+        ends = network.latent_scale.split([LATENT_DIM] if len(norms) == 1 else [1, 2, LATENT_DIM])
+        assert [part.norm().item() for part in ends] == pytest.approx(norms)

@@ -20,6 +20,10 @@ class Codebook(nn.Module):
         self.n_discrete_actions, self.latent_dim = n_discrete_actions, latent_dim
         self.codewords = nn.Parameter(th.empty(n_discrete_actions, latent_dim).uniform_(-1, 1))
 
+    def latent_widths(self) -> th.Tensor:
+        """:return: (d_e,) how wide the codeword is that an entry of the latent belongs to"""
+        return th.full((self.latent_dim,), self.latent_dim)
+
     def quantize(self, latents: th.Tensor, masks: th.Tensor | None = None) -> th.Tensor:
         """
         :param latents: (B, d_e)

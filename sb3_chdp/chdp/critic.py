@@ -15,6 +15,8 @@ from sb3_chdp.common.normalization import RunningNormalization
 SHARPNESS = 3.0
 # On a processor, softmax over fewer entries is faster where they do not lie side by side
 SLOW_SOFTMAX = 16
+# How long the codeword of a choice, of entries in [-1, 1], may be for A at most
+LATENT_NORM = 2.0
 
 
 class AttentionReads(nn.Module):
@@ -67,24 +69,30 @@ class QNetwork(nn.Module):
     parameters: what a parameter does depends on the discrete action, often by a factor. V and A are not told apart
     further: V learns what does not depend on the action (as in Wang et al., 2016).
 
+    Wide codewords are scaled down for A: with their products they would outweigh the features.
+
     :param features_dim: number of features of the state
-    :param latent_dim: width of the latent
+    :param latent_widths: (latent_dim,) how wide the codeword is that an entry of the latent belongs to
     :param n_parameters: number of parameters
     :param net_arch: hidden layers of A; V has one of half the width of the first
     :param activation_fn: activation function
     :param n_reads: number of reads
     """
 
+    latent_scale: th.Tensor
+
     def __init__(
         self,
         features_dim: int,
-        latent_dim: int,
+        latent_widths: th.Tensor,
         n_parameters: int,
         net_arch: list[int],
         activation_fn: type[nn.Module],
         n_reads: int,
     ):
         super().__init__()
+        latent_dim = len(latent_widths)
+        self.register_buffer("latent_scale", (LATENT_NORM / latent_widths.sqrt()).clamp(max=1), persistent=False)
         self.reads = AttentionReads(features_dim, latent_dim, n_reads)
         value_arch = [width // 2 for width in net_arch[:1]]
         self.value = value_mlp(features_dim, value_arch, activation_fn)
@@ -93,8 +101,9 @@ class QNetwork(nn.Module):
 
     def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
         """:return: (B, 1) values"""
+        reads, latents = self.reads(features, latents), self.latent_scale * latents
         products = (latents[:, :, None] * parameters[:, None]).flatten(1)
-        x = th.cat([features, parameters, latents, self.reads(features, latents), products], dim=1)
+        x = th.cat([features, parameters, latents, reads, products], dim=1)
         return self.value(features) + self.advantage(x)
 
     @th.no_grad()

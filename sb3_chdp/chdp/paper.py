@@ -13,8 +13,10 @@ from torch import nn
 from sb3_chdp.chdp.actor import CooperativeActor
 from sb3_chdp.chdp.candidates import Selection
 from sb3_chdp.chdp.chdp import CHDP
+from sb3_chdp.chdp.codebook import Codebook
 from sb3_chdp.chdp.critic import HybridCritic
 from sb3_chdp.chdp.policies import CHDPPolicy
+from sb3_chdp.chdp.product_codebook import ProductCodebook
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.policies import CnnFeatures, CombinedFeatures
 from sb3_chdp.common.product_table import block_widths
@@ -85,8 +87,8 @@ class PaperPolicy(CHDPPolicy):
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **{"features_extractor_class": FlattenExtractor, **kwargs})
 
-    def _make_critic(self, extractor: BaseFeaturesExtractor, latent_dim: int) -> HybridCritic:
-        n_inputs = extractor.features_dim + latent_dim + self.action_space.spec.max_parameters
+    def _make_critic(self, extractor: BaseFeaturesExtractor, codebook: Codebook | ProductCodebook) -> HybridCritic:
+        n_inputs = extractor.features_dim + codebook.latent_dim + self.action_space.spec.max_parameters
         critic_arch = get_actor_critic_arch(self.net_arch)[1]
         q_networks: list[nn.Module] = [PaperQNetwork(n_inputs, critic_arch, self.activation_fn) for _ in range(2)]
         return HybridCritic(

@@ -106,7 +106,7 @@ class CHDPPolicy(HybridPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         extractor, codebook = self.make_features_extractor(), self._make_codebook()
-        self.critic = self._make_critic(extractor, codebook.latent_dim)
+        self.critic = self._make_critic(extractor, codebook)
         self.actor = self._make_actor(extractor.features_dim, codebook)
         self.actor_target, self.critic_target = deepcopy(self.actor), deepcopy(self.critic)
         for target in (self.actor_target, self.critic_target):
@@ -133,10 +133,10 @@ class CHDPPolicy(HybridPolicy):
         self.register_buffer("fixed_discrete_actions", k, persistent=False)
         self.register_buffer("fixed_parameters", parameters, persistent=False)
 
-    def _make_critic(self, extractor: BaseFeaturesExtractor, latent_dim: int) -> HybridCritic:
+    def _make_critic(self, extractor: BaseFeaturesExtractor, codebook: Codebook | ProductCodebook) -> HybridCritic:
         n_parameters = self.action_space.spec.max_parameters
         critic_arch = get_actor_critic_arch(self.net_arch)[1]
-        sizes = extractor.features_dim, latent_dim, n_parameters, critic_arch, self.activation_fn, self.n_reads
+        sizes = extractor.features_dim, codebook.latent_widths(), n_parameters, critic_arch, self.activation_fn, self.n_reads
         q1, q2, rewards = (QNetwork(*sizes) for _ in range(3))
         return HybridCritic(
             self.observation_space,

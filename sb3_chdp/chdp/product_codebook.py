@@ -24,6 +24,10 @@ class ProductCodebook(ProductTable):
         values = [(choice, value) for choice, radix in enumerate(self.radices) for value in range(radix)]
         self.register_buffer("values", th.tensor(values), persistent=False)
 
+    def latent_widths(self) -> th.Tensor:
+        """:return: (d_e,) how wide the codeword is that an entry of the latent belongs to"""
+        return self.choice_of_column.bincount()[self.choice_of_column]
+
     def quantize(self, latents: th.Tensor, masks: th.Tensor | None = None) -> th.Tensor:
         """
         :param latents: (B, d_e)
