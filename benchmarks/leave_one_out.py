@@ -14,6 +14,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 
 from sb3_chdp.chdp import CHDP
 from sb3_chdp.chdp.candidates import Selection
+from sb3_chdp.chdp.critic import HybridCritic, QNetwork
 from sb3_chdp.chdp.policies import CHDPPolicy
 from sb3_chdp.common.samples import HybridReplaySamples
 
@@ -37,6 +38,17 @@ class UnreadingPolicy(CHDPPolicy):
     """Actions do not say what is read of the state."""
 
     n_reads: ClassVar[int] = 0
+
+
+class WideLatentsPolicy(CHDPPolicy):
+    """Critics see codewords as they are."""
+
+    def _make_critic(self, *args: Any) -> HybridCritic:
+        critic = super()._make_critic(*args)
+        for network in critic.modules():
+            if isinstance(network, QNetwork):
+                network.latent_scale.fill_(1)
+        return critic
 
 
 class HopefulPolicy(CHDPPolicy):
@@ -76,6 +88,12 @@ class WithoutReads(CHDP):
     """With :class:`UnreadingPolicy`."""
 
     policy_aliases: ClassVar[Aliases] = {"MlpPolicy": UnreadingPolicy}
+
+
+class WithoutLatentScale(CHDP):
+    """With :class:`WideLatentsPolicy`."""
+
+    policy_aliases: ClassVar[Aliases] = {"MlpPolicy": WideLatentsPolicy}
 
 
 class WithoutRandomShare(CHDP):
@@ -137,6 +155,7 @@ LEFT_OUT: dict[str, type[CHDP]] = {
     "chdp_without_normalization": WithoutNormalization,
     "chdp_without_value_scale": WithoutValueScale,
     "chdp_without_reads": WithoutReads,
+    "chdp_without_latent_scale": WithoutLatentScale,
     "chdp_without_random_share": WithoutRandomShare,
     "chdp_without_candidates": WithoutCandidates,
     "chdp_without_foresight": WithoutForesight,
