@@ -73,10 +73,18 @@ def test_rescaled_values():
     th.testing.assert_close(q_network(*inputs), 0.01 * before + 5)
 
 
-def test_wide_codewords_do_not_outweigh_features():
-    """What A sees of the codeword of a choice is no longer than 2, and narrow codewords are left alone."""
-    one = QNetwork(1, Codebook(3, LATENT_DIM).latent_widths(), 1, [8], th.nn.SiLU, 1)
-    assert one.latent_scale.norm().item() == pytest.approx(2)
-    several = QNetwork(1, ProductCodebook((2, 3, 40), LATENT_DIM).latent_widths(), 1, [8], th.nn.SiLU, 1)
-    norms = [part.norm().item() for part in several.latent_scale.split([1, 2, LATENT_DIM])]
-    assert norms == pytest.approx([1, 2**0.5, 2])
+@pytest.mark.parametrize(
+    "codebook, widths, norms",
+    [
+        (Codebook(3, LATENT_DIM), [LATENT_DIM], [2.0]),
+        (ProductCodebook((2, 3, 40), LATENT_DIM), [1, 2, LATENT_DIM], [1.0, 2**0.5, 2.0]),
+    ],
+)
+def test_wide_codewords_do_not_outweigh_features(codebook, widths, norms):
+    """What A sees of a choice's codeword, alone and times a parameter, is no longer than 2; narrow ones stay as they are."""
+    network, seen = QNetwork(1, codebook.latent_widths(), 1, [8], th.nn.SiLU, 0), []
+    network.advantage.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0][0]))
+    network(th.zeros(1, 1), th.ones(1, sum(widths)), th.ones(1, 1))
+    latents, products = seen[0][2:].chunk(2)
+    for inputs in (latents, products):
+        assert [part.norm().item() for part in inputs.split(widths)] == pytest.approx(norms)

@@ -15,7 +15,7 @@ from sb3_chdp.common.normalization import RunningNormalization
 SHARPNESS = 3.0
 # On a processor, softmax over fewer entries is faster where they do not lie side by side
 SLOW_SOFTMAX = 16
-# How long the codeword of a choice, of entries in [-1, 1], may be for A at most
+# Length of a choice's codeword for A at most; its entries are in [-1, 1]
 LATENT_NORM = 2.0
 
 
