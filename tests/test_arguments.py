@@ -128,6 +128,8 @@ def test_a_schedule_that_gives_no_number(algorithm):
     with pytest.raises(ValueError, match="learning_rate must be a finite number of at least 0, got nan"):
         model.learn(60)
     assert all(p.isfinite().all() for p in model.policy.parameters())
+    with pytest.raises(ValueError, match="learning_rate must be a finite number of at least 0, got -1"):
+        make_model(algorithm, make_layout_env(), learning_rate=lambda progress: -1.0)
 
 
 def test_load_refuses_what_is_no_argument(algorithm, tmp_path):

@@ -108,7 +108,9 @@ def test_embeddings_decode_to_their_action(trained):
 
 def test_loss_against_a_slow_loop():
     representation = ActionRepresentation(3, MASK, 4, 3, hidden_dim=8)
-    batch, noise = random_batch(20), th.randn(20, 3)
+    batch = random_batch(20)
+    th.manual_seed(1)
+    noise = th.randn(20, 3)
     mean, log_std = representation.encode(batch)
     parameters, changes = representation.decode(batch.features, batch.discrete_actions, mean + log_std.exp() * noise)
     squares, kl_divergence, dynamics = [], [], []
@@ -120,7 +122,8 @@ def test_loss_against_a_slow_loop():
             dynamics.append((changes[i, j] - batch.changes[i, j]) ** 2)
     expected = np.mean([d.item() for d in dynamics]) + 2 * np.mean([s.item() for s in squares])
     expected += 0.5 * np.mean([d.item() for d in kl_divergence])
-    assert representation.loss(batch, noise).item() == pytest.approx(expected, rel=1e-4)
+    th.manual_seed(1)
+    assert representation.loss(batch).item() == pytest.approx(expected, rel=1e-4)
 
 
 def test_warm_up_is_counted_and_its_data_is_used():

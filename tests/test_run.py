@@ -256,18 +256,23 @@ def test_actions_that_are_not_hybrid(algorithm, space):
         make_model(algorithm, LayoutEnv(space))
 
 
+class NoActions(gym.Env):
+    observation_space = box(-1, 1, 2)
+
+
 @pytest.mark.parametrize(
     ("env", "message"),
     [
         (LayoutEnv, r"an environment, got the class LayoutEnv: give an object of it, LayoutEnv\(\)"),
         (3, "an environment of .* got 3"),
         (None, "an environment of .* got None"),
+        (NoActions(), "an environment of .*, and set action_space"),
         (
             gym.make_vec("sb3_chdp/Goal-v0", 2, "sync"),
             r"a VecEnv of SB3's, as make_vec_env\(\) .* got Gymnasium's SyncVectorEnv",
         ),
     ],
-    ids=["class", "number", "none", "vector"],
+    ids=["class", "number", "none", "actions", "vector"],
 )
 def test_what_is_no_environment(algorithm, env, message):
     with pytest.raises(ValueError, match=f"env must be {message}"):

@@ -22,7 +22,7 @@ from sb3_chdp.chdp.losses import (
 )
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_chdp.chdp.value_scale import N_FIRST_SAMPLES
-from sb3_chdp.common.arguments import Accepted, number, of_networks, warn_of_cost, whole
+from sb3_chdp.common.arguments import NOT_NEGATIVE, Accepted, of_networks, warn_of_cost, whole
 from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.samples import HybridReplaySamples
@@ -104,8 +104,8 @@ class CHDP(ExploringAlgorithm):
     accepted_arguments: ClassVar[dict[str, Accepted]] = {
         "latent_dim": of_networks(whole(1)),
         "n_diffusion_steps": of_networks(whole(1)),
-        "eta": number(),
-        "codebook_lr_factor": number(),
+        "eta": NOT_NEGATIVE,
+        "codebook_lr_factor": NOT_NEGATIVE,
         "n_action_candidates": whole(1),
     }
     takes_factored = True
@@ -262,7 +262,7 @@ class CHDP(ExploringAlgorithm):
                 losses |= {"discrete_loss": loss, "diffusion_loss_discrete": diffusion_loss}
 
                 # Step 2: continuous policy and codebook, eq. 8, given the updated discrete policy
-                latents, k = self._actions_to_improve(replay_data, features)
+                latents, k, drawn_k = self._actions_to_improve(replay_data, features)
                 diffusion_loss, q_loss = continuous_policy_loss(policy, replay_data, features, latents, k)
                 loss = diffusion_loss + alpha * q_loss
                 optimizers = [policy.continuous_optimizer, policy.codebook_optimizer]
@@ -278,8 +278,7 @@ class CHDP(ExploringAlgorithm):
         for name, values in logs.items():
             self.logger.record(f"train/{name}", th.stack(values).mean().item())
         if "continuous_loss" in logs:
-            # Without the uniformly random ones
-            self._log_usage(k[round(self.uniform_fraction * len(k)) :])
+            self._log_usage(drawn_k)
 
     def _log_usage(self, k: th.Tensor) -> None:
         """
@@ -306,19 +305,18 @@ class CHDP(ExploringAlgorithm):
         return discrete_policy_loss(self.policy, replay_data, features)
 
     @th.no_grad()
-    def _actions_to_improve(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def _actions_to_improve(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, ...]:
         """
         :param replay_data: a batch
         :param features: (B, features_dim) features of the observations, without gradient
         :return: latents (B, latent_dim) and discrete actions (B,) whose parameters are improved, a share of
-            ``uniform_fraction`` random ones, and those of the discrete policy
+            ``uniform_fraction`` random ones, the others of the discrete policy; and these discrete actions alone
         """
         n_uniform, codebook, masks = round(self.uniform_fraction * len(features)), self.actor.codebook, replay_data.masks
-        latents, k = self._drawn_actions(replay_data, features, n_uniform)
-        if n_uniform > 0:
-            uniform_k = codebook.random(n_uniform, masks=None if masks is None else masks[:n_uniform])
-            latents, k = th.cat([codebook.representative_latents(uniform_k), latents]), th.cat([uniform_k, k])
-        return latents, k
+        drawn_latents, drawn_k = self._drawn_actions(replay_data, features, n_uniform)
+        uniform_k = codebook.random(n_uniform, masks=None if masks is None else masks[:n_uniform])
+        uniform_latents = codebook.representative_latents(uniform_k)
+        return th.cat([uniform_latents, drawn_latents]), th.cat([uniform_k, drawn_k]), drawn_k
 
     def _drawn_actions(self, replay_data: HybridReplaySamples, features: th.Tensor, first: int) -> tuple[th.Tensor, th.Tensor]:
         """:return: latents and discrete actions of the discrete policy, for all of a batch but the ``first`` ones"""

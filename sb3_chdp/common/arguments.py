@@ -45,11 +45,6 @@ def whole(least: int, most: float = math.inf) -> Accepted:
     return Accepted(text, lambda value: isinstance(value, Integral) and is_number(value) and least <= int(value) <= most)
 
 
-def number(least: float = 0.0) -> Accepted:
-    """:return: finite numbers from a bound on"""
-    return Accepted(f"a finite number of at least {least:g}", lambda value: is_number(value) and value >= least)
-
-
 def one_of(names: Collection[str]) -> Accepted:
     """:return: some strings"""
     return Accepted(f"one of {tuple(names)}", lambda value: isinstance(value, str) and value in names)
@@ -78,10 +73,11 @@ def _is_train_freq(value: Any) -> bool:
     return len(value) == 2 and whole(1).test(value[0]) and getattr(value[1], "value", value[1]) in ("step", "episode")
 
 
+NOT_NEGATIVE = Accepted("a finite number of at least 0", lambda value: is_number(value) and value >= 0)
 POSITIVE = Accepted("a finite number above 0", lambda value: is_number(value) and value > 0)
 FRACTION = Accepted("a number between 0 and 1", lambda value: is_number(value) and 0 <= value <= 1)
 SWITCH = Accepted("True or False", lambda value: isinstance(value, (bool, np.bool_)))
-RATE = scheduled(number())
+RATE = scheduled(NOT_NEGATIVE)
 SEED = optional(whole(0, 2**32 - 1))
 TRAIN_FREQ = Accepted('a whole number of at least 1, alone or in a tuple with "step" or "episode"', _is_train_freq)
 

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecCheckNan, VecEnv, is_vecenv_wrap
 
 from sb3_chdp.common.arguments import (
     FRACTION,
-    POSITIVE,
+    NOT_NEGATIVE,
     RATE,
     SEED,
     SWITCH,
@@ -30,7 +30,6 @@ from sb3_chdp.common.arguments import (
     check_load,
     is_class_of,
     is_number,
-    number,
     of_networks,
     one_of,
     optional,
@@ -65,7 +64,6 @@ class HybridAlgorithm(BaseAlgorithm):
         "n_steps": whole(1),
         "batch_size": whole(1),
         "gamma": FRACTION,
-        "max_grad_norm": optional(POSITIVE),
         "action_layout": of_networks(one_of(LAYOUTS)),
         "use_masking": optional(SWITCH),
         "stats_window_size": whole(1),
@@ -236,9 +234,13 @@ class HybridAlgorithm(BaseAlgorithm):
             self._last_obs = None  # the environment may have gone on, or begun anew: learning begins with a reset again
             raise
 
+    def _setup_lr_schedule(self) -> None:
+        super()._setup_lr_schedule()
+        check(NOT_NEGATIVE, learning_rate=self.lr_schedule(1))
+
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         # What a function gives is known only now
-        check(number(), learning_rate=self.lr_schedule(self._current_progress_remaining))
+        check(NOT_NEGATIVE, learning_rate=self.lr_schedule(self._current_progress_remaining))
         super()._update_learning_rate(optimizers)
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
@@ -254,7 +256,7 @@ class HybridAlgorithm(BaseAlgorithm):
         :param schedule: the rate as a function of the remaining progress
         """
         rate = schedule(self._current_progress_remaining)
-        check(number(), **{name: rate})
+        check(NOT_NEGATIVE, **{name: rate})
         update_learning_rate(optimizer, rate)
         self.logger.record(f"train/{name}", rate)
 

@@ -81,8 +81,8 @@ def check_is_env(env: Any) -> None:
         raise ValueError(f"env must be a VecEnv of SB3's, as make_vec_env() returns it, got Gymnasium's {type(env).__name__}")
     # SB3 converts environments of the old gym, where that is installed
     is_env = isinstance(env, (gym.Env, VecEnv)) or find_spec("gym") is not None
-    if not is_env or not hasattr(env, "observation_space"):
-        remedy = "derive its class from gymnasium.Env, and set observation_space"
+    if not is_env or not (hasattr(env, "action_space") and hasattr(env, "observation_space")):
+        remedy = "derive its class from gymnasium.Env, and set action_space and observation_space"
         raise ValueError(f"env must be an environment of Gymnasium's, a VecEnv of SB3's, or an id, got {env!r}: {remedy}")
 
 

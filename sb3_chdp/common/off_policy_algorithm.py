@@ -12,7 +12,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her import HerReplayBuffer
 
@@ -46,11 +46,12 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
     """
     Base class of off-policy algorithms for hybrid action spaces.
 
-    Parameters not listed here are SB3's (see :class:`OffPolicyAlgorithm`).
-
+    :param args: SB3's, see :class:`OffPolicyAlgorithm`
     :param action_layout: how to read an ambiguous action space, see :class:`HybridActionSpec`
     :param use_masking: whether to ask the environment for ``action_masks()`` and to take no discrete action that they forbid,
         see :func:`sb3_chdp.common.masks.read_masks`; None: if it has such a method
+    :param device: Device (cpu, cuda, ...) on which the code should be run; auto: the GPU if possible
+    :param kwargs: SB3's
     """
 
     accepted_arguments: ClassVar[dict[str, Accepted]] = {
@@ -69,57 +70,15 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
 
     def __init__(
         self,
-        policy: str | type[HybridPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule,
-        buffer_size: int = 1_000_000,  # 1e6
-        learning_starts: int = 100,
-        batch_size: int = 256,
-        tau: float = 0.005,
-        gamma: float = 0.99,
-        train_freq: int | tuple[int, str] = (1, "step"),
-        gradient_steps: int = 1,
-        action_noise: ActionNoise | None = None,
-        replay_buffer_class: type[ReplayBuffer] | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
-        optimize_memory_usage: bool = False,
-        n_steps: int = 1,
+        *args: Any,
         action_layout: str = "auto",
         use_masking: bool | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
         device: th.device | str = "auto",
+        **kwargs: Any,
     ):
         check_device(device)
-        super().__init__(
-            policy,
-            env,
-            learning_rate,
-            buffer_size,
-            learning_starts,
-            batch_size,
-            tau,
-            gamma,
-            train_freq,
-            gradient_steps,
-            action_noise=action_noise,
-            replay_buffer_class=replay_buffer_class,
-            replay_buffer_kwargs=replay_buffer_kwargs,
-            optimize_memory_usage=optimize_memory_usage,
-            n_steps=n_steps,
-            policy_kwargs=policy_kwargs,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            device=device,
-            seed=seed,
-            sde_support=False,
-            supported_action_spaces=HYBRID_SPACES,
-            support_multi_env=True,
-        )
+        kwargs |= dict(device=device, sde_support=False, supported_action_spaces=HYBRID_SPACES, support_multi_env=True)
+        super().__init__(*args, **kwargs)
         self.action_layout = action_layout
         self.use_masking = use_masking
 

@@ -58,10 +58,10 @@ class HybridPolicy(BasePolicy):
             do not fit or allow nothing
         """
         obs_tensor, vectorized_env = self._checked_observation(observation)
+        n = len(next(iter(obs_tensor.values())) if isinstance(obs_tensor, dict) else obs_tensor)
         if action_masks is not None:
-            n = len(obs_tensor) if isinstance(obs_tensor, th.Tensor) else len(next(iter(obs_tensor.values())))
             action_masks = read_masks(self.action_space.spec, action_masks, n)
-        if len(next(iter(obs_tensor.values())) if isinstance(obs_tensor, dict) else obs_tensor) == 0:
+        if n == 0:
             return [], state
         actions = self.action_space.to_native(self._rows(obs_tensor, deterministic, action_masks))
         return (actions if vectorized_env else actions[0]), state

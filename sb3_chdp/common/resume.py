@@ -31,7 +31,7 @@ from sb3_chdp.common.run_state import (
     save_generators,
     save_logger,
 )
-from sb3_chdp.common.serialization import import_own
+from sb3_chdp.common.serialization import import_own, qualified_name
 
 
 class _Run(NamedTuple):
@@ -198,7 +198,7 @@ class ResumableCheckpoint(BaseCallback):
         model.save(zip_file)
         writer.write("model.zip", zip_file.getbuffer())
         state = {
-            "class": f"{type(model).__module__}.{type(model).__qualname__}",
+            "class": qualified_name(type(model)),
             "n_envs": model.n_envs,
             "use_masking": bool(getattr(model, "use_masking", False)),
             "vec_wrappers": class_names(self.training_env),
@@ -214,7 +214,7 @@ class ResumableCheckpoint(BaseCallback):
                 "logger": save_logger(model),
             },
         }
-        buffer = getattr(model, "replay_buffer", None)
+        buffer = _replay_buffer(model)
         if buffer is not None:
             state["buffer"] = buffer_state(buffer)
             state["buffer_size"] = buffer.buffer_size
@@ -230,7 +230,7 @@ def _algorithm(name: str) -> type[BaseAlgorithm]:
     classes: list[type] = [BaseAlgorithm]
     for cls in classes:
         classes.extend(cls.__subclasses__())
-        if f"{cls.__module__}.{cls.__qualname__}" == name:
+        if qualified_name(cls) == name:
             return cls
     raise ValueError(f"The checkpoint is one of {name}: import that class first")
 

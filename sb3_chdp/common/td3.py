@@ -14,7 +14,7 @@ from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_chdp.common.arguments import FRACTION, SWITCH, Accepted, number, of_networks, optional
+from sb3_chdp.common.arguments import FRACTION, NOT_NEGATIVE, SWITCH, Accepted, of_networks, optional
 from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.hybrid_box import HybridBox, ScoreBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
@@ -152,13 +152,13 @@ class HybridTD3(HybridOffPolicyAlgorithm):
     """
 
     accepted_arguments: ClassVar[dict[str, Accepted]] = {
-        "target_policy_noise": number(),
-        "target_noise_clip": number(),
+        "target_policy_noise": NOT_NEGATIVE,
+        "target_noise_clip": NOT_NEGATIVE,
         "exploration_fraction": FRACTION,
         "exploration_initial_eps": FRACTION,
         "exploration_final_eps": FRACTION,
-        "exploration_noise": number(),
-        "exploration_initial_noise": optional(number()),
+        "exploration_noise": NOT_NEGATIVE,
+        "exploration_initial_noise": optional(NOT_NEGATIVE),
         "inverting_gradients": of_networks(SWITCH),
     }
     policy: HybridTD3Policy

@@ -115,7 +115,6 @@ class GoalEnv(HybridEnv):
     Masson, Ranchod and Konidaris (2016), "Reinforcement Learning with Parameterized Actions".
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
     screen_size = (480, 640)
     option_names = ("start",)
     success_outcome = "goal"

@@ -153,9 +153,6 @@ class HardMoveEnv(PointMassEnv):
             raise ValueError(f"action must be in the action space; got the bits {bits} with the strength {strength}")
         return int("".join(map(str, bits)), 2), [strength]
 
-    def _advance(self, k: int, parameters: list[float]) -> tuple[float, str, int]:
-        return self._push_with(k, parameters[0])
-
     def _motion_of(self, subset: int) -> Point:
         if not self.factored:
             x, y = self._motions[subset]
@@ -163,9 +160,10 @@ class HardMoveEnv(PointMassEnv):
         active = [motion for i, motion in enumerate(reversed(self._motions)) if subset >> i & 1]
         return sum(x for x, _ in active), sum(y for _, y in active)
 
-    def _push_with(self, subset: int, strength: float) -> tuple[float, str, int]:
-        """:param subset: active actuators as the bits of a number, actuator 0 the highest"""
-        motion_x, motion_y = self._motion_of(subset)
+    def _advance(self, k: int, parameters: list[float]) -> tuple[float, str, int]:
+        # k has active actuators as its bits, actuator 0 the highest
+        motion_x, motion_y = self._motion_of(k)
+        (strength,) = parameters
         distance_squared = self._push(FORCE * strength * motion_x, FORCE * strength * motion_y)
         if distance_squared <= CAPTURE_DISTANCE_SQUARED:
             return self._result(BONUS - distance_squared, "reached")

@@ -123,7 +123,6 @@ class PlatformEnv(HybridEnv):
     Masson, Ranchod and Konidaris (2016), "Reinforcement Learning with Parameterized Actions".
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}
     screen_size = (800, 240)
     option_names = ("start",)
     success_outcome = "finish"

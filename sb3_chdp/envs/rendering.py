@@ -78,8 +78,9 @@ class Canvas:
 
     def text(self, text: str, position: Position, colour: Colour = INK, size: int = 22, centred: bool = False) -> None:
         """:param position: left end of the text, or its centre; on half of its height"""
-        font = self.fonts.setdefault(size, pygame.font.Font(None, OVERSAMPLING * size))
-        image = font.render(text, True, colour)
+        if size not in self.fonts:
+            self.fonts[size] = pygame.font.Font(None, OVERSAMPLING * size)
+        image = self.fonts[size].render(text, True, colour)
         x, y = self._pixel(position)
         self.surface.blit(image, (x - image.get_width() // 2 if centred else x, y - image.get_height() // 2))
 

@@ -1,6 +1,8 @@
 """Hybrid proximal policy optimization."""
 
+import math
 import warnings
+from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -12,29 +14,39 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
+from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
-from torch.nn import functional as F
+from torch.autograd.graph import register_multi_grad_hook
 
 from sb3_chdp.common.arguments import (
     FRACTION,
+    NOT_NEGATIVE,
     POSITIVE,
     SWITCH,
     Accepted,
     check_device,
     is_class_of,
-    number,
     optional,
     scheduled,
     whole,
 )
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox
-from sb3_chdp.common.utils import NonFiniteLossError, gradient_step
+from sb3_chdp.common.utils import LARGEST_NORM, NonFiniteLossError, floats
 from sb3_chdp.hppo.policies import CnnPolicy, HPPOPolicy, MlpPolicy, MultiInputPolicy
 from sb3_chdp.hppo.rollout_buffers import HybridDictRolloutBuffer, HybridRolloutBuffer
 
 SelfHPPO = TypeVar("SelfHPPO", bound="HPPO")
+
+
+def check_gradients(gradients: Sequence[th.Tensor | None]) -> None:
+    """
+    :param gradients: those of one loss
+    :raises NonFiniteLossError: if their common norm is not finite: clipped to a norm, they would be 0
+    """
+    norm = math.hypot(*floats(th._foreach_norm([gradient for gradient in gradients if gradient is not None])))
+    if not norm <= LARGEST_NORM:
+        raise NonFiniteLossError("loss", norm)
 
 
 class HPPO(HybridAlgorithm, PPO):
@@ -107,8 +119,8 @@ class HPPO(HybridAlgorithm, PPO):
         "clip_range": scheduled(POSITIVE),
         "clip_range_vf": optional(scheduled(POSITIVE)),
         "normalize_advantage": SWITCH,
-        "ent_coef": number(),
-        "vf_coef": number(),
+        "ent_coef": NOT_NEGATIVE,
+        "vf_coef": NOT_NEGATIVE,
         "max_grad_norm": POSITIVE,
         "target_kl": optional(POSITIVE),
     }
@@ -241,76 +253,17 @@ class HPPO(HybridAlgorithm, PPO):
         return True
 
     def train(self) -> None:
-        # Switch to train mode (this affects batch norm / dropout)
-        self.policy.set_training_mode(True)
-        self._update_learning_rate(self.policy.optimizer)
-        remaining = self._current_progress_remaining
-        clip_range = FloatSchedule(self.clip_range)(remaining)
-        clip_range_vf = None if self.clip_range_vf is None else FloatSchedule(self.clip_range_vf)(remaining)
-
+        """PPO's: log-probabilities have two columns, so the discrete action and its parameters have a ratio each."""
         # One bad return lies in one minibatch: those before would move the policy
         returns = self.rollout_buffer.returns
         sum_of_squares = float(np.vdot(returns, returns))
         if not np.isfinite(sum_of_squares):
             raise NonFiniteLossError("value_loss", sum_of_squares)
-
-        logs: dict[str, list[th.Tensor]] = {}
-        for epoch in range(self.n_epochs):
-            logs["approx_kl"] = []  # of the last epoch
-            for rollout_data in self.rollout_buffer.get(self.batch_size):
-                values, log_prob, entropy = self.policy.evaluate_actions(rollout_data.observations, rollout_data.actions)
-                advantages = rollout_data.advantages
-                if self.normalize_advantage and len(advantages) > 1:
-                    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-
-                # Clipped surrogate loss: one ratio for the discrete action, one for its parameters
-                log_ratio = log_prob - rollout_data.old_log_prob
-                ratio = log_ratio.exp()
-                clipped_ratio = ratio.clamp(1 - clip_range, 1 + clip_range)
-                policy_loss = -th.min(advantages * ratio, advantages * clipped_ratio).mean()
-
-                values = values.flatten()
-                if clip_range_vf is not None:
-                    change = values - rollout_data.old_values
-                    values = rollout_data.old_values + change.clamp(-clip_range_vf, clip_range_vf)
-                value_loss = F.mse_loss(values, rollout_data.returns)
-
-                assert entropy is not None, "a hybrid distribution knows its entropy"
-                entropy_loss = -entropy.mean()
-                loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss
-
-                log_ratio, ratio = log_ratio.detach(), ratio.detach()
-                minibatch = {
-                    "entropy_loss": entropy_loss,
-                    "policy_gradient_loss": policy_loss,
-                    "value_loss": value_loss,
-                    # http://joschu.net/blog/kl-approx.html
-                    "approx_kl": (ratio - 1 - log_ratio).mean(),
-                    "clip_fraction": ((ratio - 1).abs() > clip_range).float().mean(),
-                }
-                for name, value in minibatch.items():
-                    logs.setdefault(name, []).append(value.detach())
-                too_far = self.target_kl is not None and minibatch["approx_kl"] > 1.5 * self.target_kl
-                if too_far:
-                    break
-                gradient_step(loss, [self.policy.optimizer], self.max_grad_norm, "loss")
-
-            self._n_updates += 1
-            if too_far:
-                if self.verbose >= 1:
-                    print(f"Early stopping at step {epoch} due to reaching max kl: {logs['approx_kl'][-1].item():.2f}")
-                break
-
-        for name, of_minibatches in logs.items():
-            self.logger.record(f"train/{name}", th.stack(of_minibatches).mean().item())
-        self.logger.record("train/loss", loss.item())
-        explained = explained_variance(self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten())
-        self.logger.record("train/explained_variance", explained)
-        self.logger.record("train/std", self.policy.log_std.exp().mean().item())
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/clip_range", clip_range)
-        if clip_range_vf is not None:
-            self.logger.record("train/clip_range_vf", clip_range_vf)
+        hook = register_multi_grad_hook([p for p in self.policy.parameters() if p.requires_grad], check_gradients)
+        try:
+            super().train()
+        finally:
+            hook.remove()
 
     def dump_logs(self, iteration: int = 0) -> None:
         if iteration > 0:

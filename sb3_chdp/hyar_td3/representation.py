@@ -150,17 +150,16 @@ class ActionRepresentation(nn.Module):
         hidden = self.decoder(F.relu(self.decoder_condition(condition)) * F.relu(self.decoder_input(z)))
         return self.parameter_head(hidden) * self.mask_of(k), self.dynamics_head(hidden)
 
-    def loss(self, batch: ActionBatch, noise: th.Tensor | None = None) -> th.Tensor:
+    def loss(self, batch: ActionBatch) -> th.Tensor:
         """
         Reconstruction of the parameters, KL divergence to N(0, I) and prediction of the change of the state.
 
         :param batch: a batch of actions
-        :param noise: (B, d2) standard normal noise of the reparametrisation, drawn if None
         :return: the weighted sum
         """
         mean, log_std = self.encode(batch)
-        noise = th.randn_like(mean) if noise is None else noise
-        parameters, changes = self.decode(batch.features, batch.discrete_actions, mean + log_std.exp() * noise)
+        z = mean + log_std.exp() * th.randn_like(mean)
+        parameters, changes = self.decode(batch.features, batch.discrete_actions, z)
         mask = self.mask_of(batch.discrete_actions)
         # Padding does not count
         reconstruction = ((parameters - batch.parameters).square() * mask).sum() / mask.sum().clamp(min=1)

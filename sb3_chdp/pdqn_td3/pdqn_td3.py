@@ -129,5 +129,5 @@ class PDQNTD3(HybridTD3):
         """:return: the negative sum of Q1 over all allowed discrete actions, with the actor's parameters"""
         with th.no_grad():
             features = self.critic.features(replay_data.observations)
-        q1, _ = self.critic(features, self.actor(replay_data.observations))
+        q1 = self.critic.q1_forward(features, self.actor(replay_data.observations))
         return -(q1 if replay_data.masks is None else q1 * replay_data.masks).sum(dim=1).mean()

@@ -121,12 +121,12 @@ class ParameterizedQNetwork(BaseModel):
         :param parameters: (B, P) parameters of all actions
         :return: (B, K) values of all actions, of both networks
         """
-        if self.multi_pass:
-            all_actions = th.arange(len(self.parameter_mask), device=features.device)
-            return self._multi_pass(features, parameters, all_actions[None])
-        q_input = th.cat([features, parameters], dim=1)
-        q1, q2 = (q_net(q_input) for q_net in self.q_networks)
+        q1, q2 = (self._of_all(q_net, features, parameters) for q_net in self.q_networks)
         return q1, q2
+
+    def q1_forward(self, features: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+        """:return: (B, K) values of all actions, of the first network alone"""
+        return self._of_all(self.q_networks[0], features, parameters)
 
     def of_actions(self, features: th.Tensor, parameters: th.Tensor, k: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -136,29 +136,33 @@ class ParameterizedQNetwork(BaseModel):
         :return: (B, 1) values of these actions, of both networks
         """
         if self.multi_pass:
-            return self._multi_pass(features, parameters, k[:, None])
-        q1, q2 = self(features, parameters)
-        return q1.gather(1, k[:, None]), q2.gather(1, k[:, None])
+            q1, q2 = (self._multi_pass(q_net, features, parameters, k[:, None]) for q_net in self.q_networks)
+        else:
+            q1, q2 = (values.gather(1, k[:, None]) for values in self(features, parameters))
+        return q1, q2
 
-    def _multi_pass(self, features: th.Tensor, parameters: th.Tensor, k: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """:return: (B, M) values of the (B, M) or (1, M) actions k, each computed from its own parameters"""
+    def _of_all(self, q_net: nn.Module, features: th.Tensor, parameters: th.Tensor) -> th.Tensor:
+        """:return: (B, K) values of all actions, of one network"""
+        if not self.multi_pass:
+            values: th.Tensor = q_net(th.cat([features, parameters], dim=1))
+            return values
+        return self._multi_pass(q_net, features, parameters, th.arange(len(self.parameter_mask), device=features.device)[None])
+
+    def _multi_pass(self, q_net: nn.Module, features: th.Tensor, parameters: th.Tensor, k: th.Tensor) -> th.Tensor:
+        """:return: (B, M) values of the (B, M) or (1, M) actions k, each computed from its own parameters, of one network"""
         columns = self.parameter_index[k]
         index = columns.flatten(1).expand(parameters.shape[0], -1)
         own_parameters = parameters.gather(1, index).view(parameters.shape[0], *columns.shape[1:]) * self.parameter_mask[k]
-        values = []
-        for q_net in self.q_networks:
-            first, *hidden, last = q_net.children()
-            assert isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
-            state_part = F.linear(features, first.weight[:, : self.features_dim], first.bias)
-            parameter_weights = first.weight[:, self.features_dim :].t()[columns]
-            if len(k) == 1:  # the same actions for all
-                parameter_part = th.einsum("bmp,mpu->bmu", own_parameters, parameter_weights[0])
-            else:
-                parameter_part = th.einsum("bmp,bmpu->bmu", own_parameters, parameter_weights)
-            units = nn.Sequential(*hidden)(state_part[:, None] + parameter_part)
-            values.append((units * last.weight[k]).sum(dim=2) + last.bias[k])
-        q1, q2 = values
-        return q1, q2
+        first, *hidden, last = q_net.children()
+        assert isinstance(first, nn.Linear) and isinstance(last, nn.Linear)
+        state_part = F.linear(features, first.weight[:, : self.features_dim], first.bias)
+        parameter_weights = first.weight[:, self.features_dim :].t()[columns]
+        if len(k) == 1:  # the same actions for all
+            parameter_part = th.einsum("bmp,mpu->bmu", own_parameters, parameter_weights[0])
+        else:
+            parameter_part = th.einsum("bmp,bmpu->bmu", own_parameters, parameter_weights)
+        units = nn.Sequential(*hidden)(state_part[:, None] + parameter_part)
+        return (units * last.weight[k]).sum(dim=2) + last.bias[k]
 
 
 def mask_values(q_values: th.Tensor, masks: th.Tensor | None) -> th.Tensor:
@@ -217,7 +221,7 @@ class PDQNTD3Policy(HybridTD3Policy):
         self, observation: PyTorchObs, deterministic: bool = False, action_masks: th.Tensor | None = None
     ) -> th.Tensor:
         parameters = self.actor(observation)
-        q1, _ = self.critic(self.critic.features(observation), parameters)
+        q1 = self.critic.q1_forward(self.critic.features(observation), parameters)
         k = mask_values(q1, action_masks).argmax(dim=1)
         return self.action_space.columns.pack(discrete_actions=k, parameters=parameters)
 
