@@ -1,7 +1,7 @@
 """
-The published models, from the runs that ``sb3-chdp benchmark paper`` has left.
+The published models, from runs of ``sb3-chdp benchmark``.
 
-    python benchmarks/release.py --results logs/paper     for every environment CHDP's best seed, and HyAR-TD3 on Hard Move 6
+    python benchmarks/release.py --results logs/benchmark  for every environment CHDP's best seed, and HyAR-TD3 on Hard Move 6
     sb3-chdp enjoy --env Platform-v0 -f benchmarks/models  watch one
 
 A published model is a full zip of its algorithm, made small: the online networks of CHDP are replaced by their targets, by
@@ -50,7 +50,7 @@ def save_compressed(model: BaseAlgorithm, path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--results", type=Path, default=Path("logs/paper"))
+    parser.add_argument("--results", type=Path, default=Path("logs/benchmark"))
     args = parser.parse_args()
     scores = scores_of(read_results(args.results))
     for algo, env_id in PUBLISHED:

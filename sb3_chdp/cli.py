@@ -139,7 +139,7 @@ def run_script(command: str, arguments: list[str]) -> None:
         check_env(option(arguments, "--env"))
         if command == "record" or (command == "push_to_hub" and "--no-render" not in arguments):
             check_renders(option(arguments, "--env") or "")
-    if command == "enjoy" and "--no-render" not in arguments and not has_display():
+    if command == "enjoy" and not {"--no-render", *HELP} & set(arguments) and not has_display():
         raise ArgumentsError("there is no display to show it on; --no-render gives numbers, sb3-chdp record a video")
     if command == "record":
         from stable_baselines3.common import vec_env

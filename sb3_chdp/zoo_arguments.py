@@ -153,7 +153,7 @@ def complete(command: str, arguments: list[str]) -> list[str]:
     names = READERS[command]
     folder, algo, env = (option(arguments, *of) for of in (names.folder, names.algo, names.env))
     is_plot = not names.exp_id
-    if HELP & set(arguments) or (folder is not None and (is_plot or env is not None)):
+    if HELP & set(arguments) or (folder is not None and (command == "all_plots" or env is not None)):
         return arguments
     # Not the folders that a tuning leaves behind; those with checkpoints alone if the user asks for one
     any_file = any(argument.startswith("--load-") for argument in arguments)

@@ -50,7 +50,8 @@ def logs(tmp_path, monkeypatch):
         ("all_plots", "--env Goal-v0", "-f logs -a hppo"),
         ("enjoy", "--folder logs --algo chdp", "--env Goal-v0 --exp-id 1"),
         ("enjoy", "--folder elsewhere --env Goal-v0", ""),
-        ("plot", "-f elsewhere", ""),
+        ("plot", "-f logs", "-a chdp -e sb3_chdp/Platform-v0"),
+        ("all_plots", "-f elsewhere", ""),
         ("enjoy", "--help", ""),
     ],
 )
@@ -65,6 +66,7 @@ def test_the_last_run(logs, command, arguments, added):
         ("record", "--env sb3_chdp/Platform-v0", "no finished run on sb3_chdp/Platform-v0 in logs"),
         ("plot", "--env Other-v0", "no run with a finished episode on Other-v0 in logs"),
         ("enjoy", "--folder elsewhere", "no finished run in elsewhere"),
+        ("plot", "-f elsewhere", "no run with a finished episode in elsewhere"),
     ],
 )
 def test_no_such_run(logs, command, arguments, message):
