@@ -345,9 +345,3 @@ def test_normalization_within_what_reshapes_observations(off_policy_algorithm):
 def test_unbounded_parameters(algorithm):
     with pytest.raises(ValueError, match="unbounded"):
         make_model(algorithm, LayoutEnv(spaces.Tuple((spaces.Discrete(2), box(-np.inf, 1, 2)))))
-
-
-@pytest.mark.parametrize("name", ["policy_delay", "n_diffusion_steps", "latent_dim", "n_action_candidates"])
-def test_bad_arguments_of_chdp(name):
-    with pytest.raises(ValueError, match=f"{name} must be a whole number of at least 1, got 0"):
-        make_model(CHDP, make_layout_env(), **{name: 0})

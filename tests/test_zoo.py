@@ -1,5 +1,6 @@
 """The command line, really run on tiny budgets."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ import yaml
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_chdp import ALGORITHMS, CHDP
-from sb3_chdp.cli import SCRIPTS
+from sb3_chdp.cli import DISPLAYS, SCRIPTS
 from sb3_chdp.envs import ENV_IDS
 from sb3_chdp.zoo_plots import tell_runs_apart
 from tests.commands import main, run, start
@@ -167,8 +168,15 @@ def test_stock_algorithm_with_a_wrapper_of_the_users(trained):
     run("train", "--algo", "sb3:sac", "--env", ENV_ID, "-conf", "sac.yml", "--eval-freq", "-1", "-f", "stock", cwd=trained)
 
 
+def main_without_display(*arguments):
+    for name in DISPLAYS:
+        os.environ.pop(name, None)
+    main(*arguments)
+
+
 def test_help_and_unknown_command(tmp_path):
     assert "sb3-chdp train" in run("--help", cwd=tmp_path)
+    assert "--no-render" in run("enjoy", "--help", cwd=tmp_path, main=main_without_display)
     message = run("trian", cwd=tmp_path, code=1)
     assert "unknown command 'trian', did you mean train?" in message and all(script in message for script in SCRIPTS)
 
