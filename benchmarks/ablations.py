@@ -112,8 +112,10 @@ class WithoutCodebook(CHDP):
 class WithoutSequentialUpdate(CHDP):
     """The continuous policy is improved for the stored actions, whatever the discrete policy does."""
 
-    def _drawn_actions(self, replay_data: HybridReplaySamples, features: th.Tensor, first: int) -> tuple[th.Tensor, th.Tensor]:
-        return replay_data.latents[first:], replay_data.discrete_actions[first:]
+    def _actions_to_improve(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        latents, k = super()._actions_to_improve(replay_data, features)
+        n = round(self.uniform_fraction * len(k))
+        return th.cat([latents[:n], replay_data.latents[n:]]), th.cat([k[:n], replay_data.discrete_actions[n:]])
 
 
 class WithoutBoth(WithoutCodebook, WithoutSequentialUpdate):

@@ -1,15 +1,17 @@
-"""What was run for the published tables, read from the files of the runs: the lines of ``protocol.yml``."""
+"""What was run for the published tables, read from the files of the runs; for that of the algorithms, ``protocol.yml``."""
 
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from sb3_chdp.benchmark.manager import settings_of
-from sb3_chdp.benchmark.paper import MAIN, Cell
+from sb3_chdp.benchmark.paper import Cell
 from sb3_chdp.benchmark.results import differences, read_meta
 from sb3_chdp.benchmark.runs import Run
 
 COMMIT_DIGITS = 12
+# The table of the algorithms; the others are CHDP with its one setting, and ablations
+MAIN = "main"
 
 
 def deviation_column(cells: list[Cell]) -> Callable[[str, str], str]:
@@ -46,7 +48,7 @@ def describe_cells(results: Path, table: str) -> list[Cell]:
     """
     :param results: folder of the published results
     :param table: a folder in it
-    :return: cells of the protocol, as the files tell
+    :return: a cell for each environment and algorithm or variant, as the files tell; see ``sb3_chdp/benchmark/paper.py``
     """
     cells: list[Cell] = []
     for folder in sorted({path.parent for path in (results / table).glob("*/*/seed_*.json")}):

@@ -12,10 +12,9 @@ from pathlib import Path
 
 import pandas as pd
 import yaml
-from protocol import describe_cells, deviation_column
+from protocol import MAIN, describe_cells, deviation_column
 
 from sb3_chdp.benchmark import figures, paper, tables
-from sb3_chdp.benchmark.paper import MAIN
 from sb3_chdp.benchmark.results import read_results
 from sb3_chdp.benchmark.runs import display_name
 from sb3_chdp.benchmark.statistics import scores_of
@@ -92,19 +91,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--print", action="store_true", dest="only_print")
     args = parser.parse_args()
-    protocol = {table: describe_cells(RESULTS, table) for table in (MAIN, ONE_SETTING, *TABLES)}
+    protocol = describe_cells(RESULTS, MAIN)
     scores_today = scores_of(read_results(RESULTS / ONE_SETTING))
-    today = one_setting(yaml_order(protocol[ONE_SETTING]), scores_today)
+    today = one_setting(yaml_order(describe_cells(RESULTS, ONE_SETTING)), scores_today)
     results = read_results(RESULTS / MAIN)
     scores = scores_of(results)
-    envs = tables.order(scores["env"], [cell["environment"] for cell in yaml_order(protocol[MAIN])])
+    envs = tables.order(scores["env"], [cell["environment"] for cell in yaml_order(protocol)])
     rows = tables.order(scores["row"], list(ALGORITHMS))
-    columns = {"paper": paper.paper_column, "settings": deviation_column(protocol[MAIN])}
+    columns = {"paper": paper.paper_column, "settings": deviation_column(protocol)}
     parts = [tables.report(scores, rows, envs, columns)]
     for table, title in TABLES.items():
         ablation = scores_of(read_results(RESULTS / table))
         variants = tables.order(ablation["row"], list(VARIANTS))
-        columns = {"paper": paper_column, "settings": deviation_column(protocol[table])}
+        columns = {"paper": paper_column, "settings": deviation_column(describe_cells(RESULTS, table))}
         parts += [f"### {title}", tables.score_table(ablation, variants, tables.order(ablation["env"], []), columns)]
     text = "\n\n".join(parts)
     print(text, today, sep="\n\n")

@@ -58,8 +58,9 @@ SCRIPTS = {
 COMMANDS = (*SCRIPTS, "benchmark")
 # Scripts that import the modules of --gym-packages themselves, and note them among a run's arguments
 IMPORTERS = ("train", "optimize", "enjoy")
-# Scripts that play a model
+# Scripts that play a model, and those that load one
 PLAYERS = ("enjoy", "record", "push_to_hub")
+LOADERS = ("train", *PLAYERS)
 # Environment variables of which Linux has one where a window can be shown
 DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
 # What rl_zoo3 2.9.2 imports, declared by it or not
@@ -111,9 +112,11 @@ def run_script(command: str, arguments: list[str]) -> None:
     :param arguments: what the user wrote behind it
     :raises ArgumentsError: if the command does not work with them
     """
-    from sb3_chdp.zoo import play_with_masks, register
+    from sb3_chdp.zoo import play_with_masks, register, trust_own_runs
 
     register()
+    if command in LOADERS:
+        trust_own_runs()
     if command in PLAYERS:
         play_with_masks()
     others, packages = split_option(arguments, "--gym-packages")

@@ -14,9 +14,9 @@ from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, make_layout_env
 N_ACTIONS = 3
 KINDS = {
     "drawn": Selection(n_drawn=4),
-    "uniform": Selection(n_drawn=2, n_uniform=N_ACTIONS),
+    "uniform": Selection(n_drawn=2, n_alternatives=N_ACTIONS),
     "random": Selection(n_drawn=1, n_random=8),
-    "all": Selection(n_drawn=2, n_uniform=2, n_random=5),
+    "all": Selection(n_drawn=2, n_alternatives=2, n_random=5),
 }
 SELECTIONS = pytest.mark.parametrize("select", KINDS.values(), ids=KINDS)
 
@@ -42,7 +42,7 @@ def near(value):
 
 def fixed_draws(actor, batch_size, select):
     """All that is random in a selection."""
-    n_latents, n_parameters = batch_size * select.n_drawn, batch_size * (select.n_drawn + select.n_uniform)
+    n_latents, n_parameters = batch_size * select.n_drawn, batch_size * (select.n_drawn + select.n_alternatives)
     latents, parameters = actor.discrete_policy, actor.continuous_policy
     return FixedDraws(
         th.randn(latents.n_steps, n_latents, latents.dim),
@@ -73,7 +73,7 @@ def test_the_best_of_all_candidates_is_taken(actor, select):
     assert latents.shape == (5, 4) and k.shape == (5,) and parameters.shape == (5, 1)
     assert (actor.codebook.quantize(latents) == k).all()
     (asked,) = critic.asked
-    n = select.n_drawn + select.n_uniform + select.n_random
+    n = select.n_drawn + select.n_alternatives + select.n_random
     assert len(asked[0]) == 5 * n and (asked[0].view(5, n, -1) == features[:, None]).all()
     best = asked[3].view(5, n).argmax(dim=1)
     for chosen, of_all in ((latents, asked[1]), (parameters, asked[2])):
@@ -101,9 +101,9 @@ def test_every_discrete_action_competes_where_there_are_few(actor):
 
 def test_three_discrete_actions_all_compete_in_targets():
     """An action that is missing among the next ones makes states worth too little in which it is the best."""
-    assert filled_model().policy.select_target.n_uniform == N_ACTIONS == 3
+    assert filled_model().policy.select_target.n_alternatives == N_ACTIONS == 3
     many = LayoutEnv(spaces.Tuple((spaces.Discrete(N_NEXT_ACTIONS), box(-1, 1, 1))))
-    assert filled_model(many).policy.select_target.n_uniform < N_NEXT_ACTIONS
+    assert filled_model(many).policy.select_target.n_alternatives < N_NEXT_ACTIONS
 
 
 def test_sampled_values_try_what_the_critics_disagree_about(actor):

@@ -291,7 +291,7 @@ def test_stock_algorithms_take_allowed_actions(layout):
 def test_parameters_of_allowed_actions_are_improved():
     model = fast_model(env=make_vec_env(MaskedEnv, 2)).learn(60)
     batch = sample(model, 64)
-    _, k, _ = model._actions_to_improve(batch, model.critic.features(batch.observations).detach())
+    _, k = model._actions_to_improve(batch, model.critic.features(batch.observations).detach())
     assert batch.masks[th.arange(64), k].all()
 
 

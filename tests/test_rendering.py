@@ -61,14 +61,14 @@ def test_last_picture_says_how_the_episode_ended():
 
 
 @pytest.mark.parametrize("env_id", ENV_IDS)
-def test_frame_callback(env_id):
-    """It sees every frame inside a step, and changes nothing."""
+def test_every_frame_is_shown(env_id):
+    """A window shows every frame inside a step, and changes nothing."""
     watched, other = gym_make(env_id).unwrapped, gym_make(env_id).unwrapped
     spec = HybridActionSpec(watched.action_space)
     states = []
     for env in (watched, other):
         env.reset(seed=3)
-    watched.frame_callback = lambda: states.append(watched.get_state())
+    watched.render_mode, watched.render = "human", lambda: states.append(watched.get_state())
     watched.reset(), other.reset()
     assert len(states) == 1, "the first frame of an episode"
     for row in spec.sample_rows(np.random.default_rng(0), 20):

@@ -1,6 +1,7 @@
 """Zips, replay buffers, resuming."""
 
 import io
+import pickle
 import warnings
 import zipfile
 from collections import OrderedDict
@@ -74,6 +75,18 @@ def test_copies_and_files_in_memory(algorithm):
         file = io.BytesIO()
         part.save(file)
         same_predictions(model, type(part).load(file))
+
+
+def test_pickled_models_train_as_the_original_does(algorithm):
+    model = make_model(algorithm, make_layout_env()).learn(30)
+    copies = [deepcopy(model), pickle.loads(pickle.dumps(model))]
+    for copied in copies:
+        copied.learn(30, reset_num_timesteps=False)
+        # What targets have beside weights, too
+        parts = copied.policy.state_dict()
+        for name, part in parts.items():
+            if "running_" in name and "_target" in name:
+                assert th.equal(part, parts[name.replace("_target", "")]), name
 
 
 def test_replay_buffer(off_policy_algorithm, tmp_path):

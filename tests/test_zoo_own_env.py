@@ -65,6 +65,28 @@ def test_own_environment(algo, settings, run_that, tmp_path):
     assert message == "sb3-chdp enjoy: unknown environment 'Own-v0' (--gym-packages names the module that registers it)\n"
 
 
+OWN_NETWORKS = """
+from stable_baselines3.common.torch_layers import FlattenExtractor
+
+
+class OwnExtractor(FlattenExtractor):
+    pass
+
+
+policy_kwargs = dict(features_extractor_class=OwnExtractor)
+hyperparams = {"Own-v0": dict(n_timesteps=20, n_steps=5, batch_size=10, policy_kwargs=policy_kwargs)}
+"""
+
+
+def test_own_networks(tmp_path):
+    """Classes of the user's own, which need trust elsewhere."""
+    (tmp_path / "mine.py").write_text(OWN_ENV + OWN_NETWORKS)
+    arguments = ["train", "--algo", "hppo", "--env", "Own-v0", "--gym-packages", "mine", "-conf", "mine", "--eval-freq", "-1"]
+    run(*arguments, cwd=tmp_path)
+    run("enjoy", "--gym-packages", "mine", "--no-render", "-n", "5", cwd=tmp_path)
+    run(*arguments, "-i", "logs/hppo/Own-v0_1/Own-v0.zip", "-f", "continued", cwd=tmp_path)
+
+
 def test_settings_that_say_little(tmp_path):
     """Policy and number of steps need not stand in a file."""
     (tmp_path / "mine.py").write_text(OWN_ENV)

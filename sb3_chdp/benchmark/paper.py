@@ -1,9 +1,9 @@
 """
 The published table: what was run for it (``protocol.yml``), and what the paper prints (``paper.yml``).
 
-A line of the protocol is a cell: ``environment``, ``algorithm`` (of an ablation also its ``variant``), ``steps``, ``seeds``
-with the commit of each, ``eval_freq`` where it was not a thirtieth of the steps, and ``deviations``, the settings of its runs
-that are not those of the YAML files today.
+A line of the protocol is a cell: ``environment``, ``algorithm``, ``steps``, ``seeds`` with the commit of each, ``eval_freq``
+where it was not a thirtieth of the steps, and ``deviations``, the settings of its runs that are not those of the YAML files
+today.
 """
 
 from functools import cache
@@ -16,15 +16,13 @@ from sb3_chdp.benchmark.runs import Run
 
 PROTOCOL = Path(__file__).with_name("protocol.yml")
 PAPER = Path(__file__).with_name("paper.yml")
-# The table of the algorithms; the others are CHDP with its one setting, and ablations
-MAIN = "main"
 EVAL_EPISODES = 100
 Cell = dict[str, Any]
 
 
-def load_protocol() -> dict[str, list[Cell]]:
-    """:return: cells of every table"""
-    protocol: dict[str, list[Cell]] = yaml.safe_load(PROTOCOL.read_text())
+def load_protocol() -> list[Cell]:
+    """:return: cells of the table"""
+    protocol: list[Cell] = yaml.safe_load(PROTOCOL.read_text())
     return protocol
 
 
@@ -70,6 +68,6 @@ def published_runs(out: str, **settings: Any) -> list[Run]:
             eval_episodes=EVAL_EPISODES,
             **settings,
         )
-        for cell in load_protocol()[MAIN]
+        for cell in load_protocol()
         for seed in cell["seeds"]
     ]

@@ -35,7 +35,7 @@ class FixedDraws(NamedTuple):
     What takes the place of everything random, so that a prediction can be repeated.
 
     :ivar latent_noise: (N, B * n_drawn, latent_dim) noise of the discrete policy's chains
-    :ivar parameter_noise: (N, B * (n_drawn + n_uniform), Pmax) noise of the continuous policy's chains
+    :ivar parameter_noise: (N, B * (n_drawn + n_alternatives), Pmax) noise of the continuous policy's chains
     :ivar discrete_actions: (n_random, ...) those of the random actions, which are the same for all observations
     :ivar parameters: (n_random, Pmax) their parameters, padding 0
     """
@@ -101,7 +101,7 @@ def drawn_candidates(
     actor: CooperativeActor,
     features: th.Tensor,
     n: int,
-    n_uniform: int,
+    n_alternatives: int,
     fixed: FixedDraws | None = None,
     masks: th.Tensor | None = None,
 ) -> Candidates:
@@ -111,7 +111,7 @@ def drawn_candidates(
     :param actor: the policies
     :param features: (B, features_dim) features of the observations
     :param n: number of actions per observation that both policies draw
-    :param n_uniform: number of further discrete actions, see :meth:`Codebook.alternatives`
+    :param n_alternatives: number of further discrete actions, see :meth:`Codebook.alternatives`
     :param fixed: what to take for all that is random; None: draw
     :param masks: (B, K) False for discrete actions that the discrete policy may not draw, None if it may draw all
     """
@@ -121,11 +121,13 @@ def drawn_candidates(
     masks = None if masks is None else masks.repeat_interleave(n, dim=0)
     latents, k = actor.sample_latents(features.repeat_interleave(n, dim=0), latent_noise, masks)
     latents, k = latents.unflatten(0, (batch_size, n)), k.unflatten(0, (batch_size, n))
-    if n_uniform > 0:
-        uniform_k = codebook.alternatives(k[:, 0], n_uniform, fixed is not None)
+    if n_alternatives > 0:
+        uniform_k = codebook.alternatives(k[:, 0], n_alternatives, fixed is not None)
         latents, k = th.cat([codebook.representative_latents(uniform_k), latents], dim=1), th.cat([uniform_k, k], dim=1)
-    parameters = actor.sample_parameters(features.repeat_interleave(n + n_uniform, dim=0), k.flatten(0, 1), parameter_noise)
-    return Candidates(latents, k, parameters.view(batch_size, n + n_uniform, -1))
+    parameters = actor.sample_parameters(
+        features.repeat_interleave(n + n_alternatives, dim=0), k.flatten(0, 1), parameter_noise
+    )
+    return Candidates(latents, k, parameters.view(batch_size, n + n_alternatives, -1))
 
 
 def random_candidates(actor: CooperativeActor, batch_size: int, n: int, fixed: FixedDraws | None) -> Candidates:
@@ -154,10 +156,8 @@ def changed_candidates(actor: CooperativeActor, actions: SelectedActions, n: int
     :return: candidates of B observations, the given action first, n + 1 in all
     """
     k = actor.codebook.alternatives(actions.discrete_actions, n, repeatable)
-    latents = actor.codebook.representative_latents(k)
-    parameters = actions.parameters[:, None].expand(-1, n, -1)
-    changed = Candidates(latents, k, parameters)
-    return Candidates(actions.latents[:, None], actions.discrete_actions[:, None], actions.parameters[:, None]).join(changed)
+    given = Candidates(*(part[:, None] for part in actions))
+    return given.join(Candidates(actor.codebook.representative_latents(k), k, given.parameters.expand(-1, n, -1)))
 
 
 @cache
@@ -205,7 +205,8 @@ class Selection:
     tried, as in Thompson sampling.
 
     :param n_drawn: number of actions per observation that both policies draw
-    :param n_uniform: number of uniformly random discrete actions with parameters of the continuous policy
+    :param n_alternatives: number of further discrete actions with parameters of the continuous policy: successive ones from a
+        random one on, or evenly spread ones
     :param n_random: number of uniformly random actions
     :param n_changed: number of discrete actions that take the place of that of the best of all these, for spaces in which all
         share their parameters
@@ -215,7 +216,7 @@ class Selection:
     """
 
     n_drawn: int
-    n_uniform: int = 0
+    n_alternatives: int = 0
     n_random: int = 0
     n_changed: int = 0
     n_refined: int = 0
@@ -240,7 +241,7 @@ class Selection:
         def allowed(candidates: Candidates) -> th.Tensor | None:
             return None if masks is None else actor.codebook.allowed(candidates.discrete_actions, masks)
 
-        candidates = drawn_candidates(actor, features, self.n_drawn, self.n_uniform, fixed, masks)
+        candidates = drawn_candidates(actor, features, self.n_drawn, self.n_alternatives, fixed, masks)
         if self.n_random > 0:
             candidates = candidates.join(random_candidates(actor, features.shape[0], self.n_random, fixed))
         best = candidates.best(critic, features, allowed(candidates), self.sampled)

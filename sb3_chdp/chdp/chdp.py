@@ -16,17 +16,15 @@ from sb3_chdp.chdp.losses import (
     continuous_policy_loss,
     critic_loss,
     discrete_policy_loss,
-    return_loss,
-    reward_loss,
+    losses_beside_critics,
     target_values,
 )
 from sb3_chdp.chdp.policies import CHDPPolicy, CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_chdp.chdp.value_scale import N_FIRST_SAMPLES
 from sb3_chdp.common.arguments import NOT_NEGATIVE, Accepted, of_networks, warn_of_cost, whole
 from sb3_chdp.common.buffers import PrioritizedReplayBuffer
-from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.samples import HybridReplaySamples
-from sb3_chdp.common.utils import TargetUpdate, gradient_step
+from sb3_chdp.common.utils import gradient_step
 
 # High at first, and 0 in the end: what is learnt settles
 LEARNING_RATE = LinearSchedule(1e-3, 0.0, 1.0)
@@ -63,8 +61,8 @@ class CHDP(ExploringAlgorithm):
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str), with a hybrid action space
-    :param learning_rate: learning rate of all networks; it can be a function of the current progress remaining (from 1 to 0)
-        (by default it falls linearly from 1e-3 to 0)
+    :param learning_rate: learning rate, that of the codebook times ``codebook_lr_factor``; it can be a function of the current
+        progress remaining (from 1 to 0) (by default it falls linearly from 1e-3 to 0)
     :param buffer_size: size of the replay buffer
     :param learning_starts: how many steps of the model to collect transitions for before learning starts
     :param batch_size: Minibatch size for each gradient update
@@ -108,12 +106,11 @@ class CHDP(ExploringAlgorithm):
         "codebook_lr_factor": NOT_NEGATIVE,
         "n_action_candidates": whole(1),
     }
-    takes_factored = True
     # Share of uniformly random discrete actions for which the continuous policy is improved
     uniform_fraction: ClassVar[float] = 0.5
     # Whether the critics' loss trains the codebook
     critics_train_codebook: ClassVar[bool] = True
-    # Bound on the gradient norm of every network. Most batches of the critics reach it, and count alike: with a wider one they
+    # Bound on the gradient norm of an optimizer. Most batches of the critics reach it, and count alike: with a wider one they
     # forget now and then what they had learnt
     max_grad_norm: ClassVar[float] = 1.0
 
@@ -198,20 +195,9 @@ class CHDP(ExploringAlgorithm):
             n_action_candidates=self.n_action_candidates,
         )
 
-    def _make_hybrid_space(self, action_layout: str) -> HybridBox:
-        return HybridBox(self.action_space, action_layout, state_parts=self._state_parts())
-
     def _setup_model(self) -> None:
         super()._setup_model()
         warn_of_cost(CHDP, n_diffusion_steps=self.n_diffusion_steps, batch_size=self.batch_size)
-        self._create_aliases()
-        self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
-
-    def _create_aliases(self) -> None:
-        self.actor = self.policy.actor
-        self.actor_target = self.policy.actor_target
-        self.critic = self.policy.critic
-        self.critic_target = self.policy.critic_target
 
     def train(self, gradient_steps: int, batch_size: int = 128) -> None:
         # Switch to train mode (this affects batch norm / dropout)
@@ -222,8 +208,7 @@ class CHDP(ExploringAlgorithm):
         if self.critics_train_codebook:
             critic_optimizers.append(policy.codebook_optimizer)
         if self._n_updates == 0 and policy.value_scale.adapts:
-            first = self._sample_batch(N_FIRST_SAMPLES)
-            policy.value_scale.start(first.rewards, (1 - first.dones) * first.discounts)
+            self._start_values()
 
         logs: dict[str, list[th.Tensor]] = {}
         for _ in range(gradient_steps):
@@ -242,13 +227,11 @@ class CHDP(ExploringAlgorithm):
                 self.replay_buffer.update_priorities(replay_data.indices, errors)
             losses = {"critic_loss": loss, "q_mean": policy.value_scale.values(q1).mean()}
             features = features.detach()
-            # The reward alone, for foresight, and what returns add to values, for targets; PaperCHDP has neither
-            if policy.reward_optimizer is not None:
-                loss = losses["reward_loss"] = reward_loss(policy, replay_data, features, targets[:, 1:])
-                if replay_data.returns is not None:
-                    losses["return_loss"] = return_loss(policy, replay_data, features, targets[:, :1] - q1)
-                    loss = loss + losses["return_loss"]
+            if policy.reward_optimizer is not None:  # PaperCHDP has no networks beside the critics
+                beside = losses_beside_critics(policy, replay_data, features, targets, q1)
+                loss = th.stack(list(beside.values())).sum()
                 gradient_step(loss, [policy.reward_optimizer], self.max_grad_norm, "reward_loss")
+                losses |= beside
 
             if self._n_updates % self.policy_delay == 0:
                 with th.no_grad():
@@ -262,7 +245,7 @@ class CHDP(ExploringAlgorithm):
                 losses |= {"discrete_loss": loss, "diffusion_loss_discrete": diffusion_loss}
 
                 # Step 2: continuous policy and codebook, eq. 8, given the updated discrete policy
-                latents, k, drawn_k = self._actions_to_improve(replay_data, features)
+                latents, k = self._actions_to_improve(replay_data, features)
                 diffusion_loss, q_loss = continuous_policy_loss(policy, replay_data, features, latents, k)
                 loss = diffusion_loss + alpha * q_loss
                 optimizers = [policy.continuous_optimizer, policy.codebook_optimizer]
@@ -278,7 +261,7 @@ class CHDP(ExploringAlgorithm):
         for name, values in logs.items():
             self.logger.record(f"train/{name}", th.stack(values).mean().item())
         if "continuous_loss" in logs:
-            self._log_usage(drawn_k)
+            self._log_usage(k[round(self.uniform_fraction * batch_size) :])
 
     def _log_usage(self, k: th.Tensor) -> None:
         """
@@ -296,6 +279,10 @@ class CHDP(ExploringAlgorithm):
         replay_data = super()._sample_batch(batch_size)
         return replay_data._replace(latents=self._latents(replay_data))
 
+    def _start_values(self) -> None:
+        first = self._sample_batch(N_FIRST_SAMPLES)
+        self.policy.value_scale.start(first.rewards, (1 - first.dones) * first.discounts)
+
     def _latents(self, replay_data: HybridReplaySamples) -> th.Tensor:
         """:return: (B, latent_dim) latents of the stored actions: their present codewords"""
         return self.actor.codebook.representative_latents(replay_data.discrete_actions)
@@ -305,23 +292,18 @@ class CHDP(ExploringAlgorithm):
         return discrete_policy_loss(self.policy, replay_data, features)
 
     @th.no_grad()
-    def _actions_to_improve(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, ...]:
+    def _actions_to_improve(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         :param replay_data: a batch
         :param features: (B, features_dim) features of the observations, without gradient
-        :return: latents (B, latent_dim) and discrete actions (B,) whose parameters are improved, a share of
-            ``uniform_fraction`` random ones, the others of the discrete policy; and these discrete actions alone
+        :return: latents (B, latent_dim) and discrete actions (B,) whose parameters are improved, first a share of
+            ``uniform_fraction`` random ones, then those of the discrete policy
         """
-        n_uniform, codebook, masks = round(self.uniform_fraction * len(features)), self.actor.codebook, replay_data.masks
-        drawn_latents, drawn_k = self._drawn_actions(replay_data, features, n_uniform)
-        uniform_k = codebook.random(n_uniform, masks=None if masks is None else masks[:n_uniform])
-        uniform_latents = codebook.representative_latents(uniform_k)
-        return th.cat([uniform_latents, drawn_latents]), th.cat([uniform_k, drawn_k]), drawn_k
-
-    def _drawn_actions(self, replay_data: HybridReplaySamples, features: th.Tensor, first: int) -> tuple[th.Tensor, th.Tensor]:
-        """:return: latents and discrete actions of the discrete policy, for all of a batch but the ``first`` ones"""
-        masks = None if replay_data.masks is None else replay_data.masks[first:]
-        return self.actor.sample_latents(features[first:], masks=masks)
+        n, codebook, masks = round(self.uniform_fraction * len(features)), self.actor.codebook, replay_data.masks
+        masks_uniform, masks_drawn = (None, None) if masks is None else (masks[:n], masks[n:])
+        drawn_latents, drawn_k = self.actor.sample_latents(features[n:], masks=masks_drawn)
+        uniform_k = codebook.random(n, masks=masks_uniform)
+        return th.cat([codebook.representative_latents(uniform_k), drawn_latents]), th.cat([uniform_k, drawn_k])
 
     def _update_learning_rates(self) -> None:
         """Set the learning rates of all optimizers according to their schedules."""
@@ -331,10 +313,6 @@ class CHDP(ExploringAlgorithm):
         self._update_own_learning_rate(
             policy.codebook_optimizer, "codebook_learning_rate", lambda left: self.codebook_lr_factor * self.lr_schedule(left)
         )
-
-    def _excluded_save_params(self) -> list[str]:
-        parts_of_policy = ["actor", "critic", "actor_target", "critic_target", "update_targets"]
-        return [*super()._excluded_save_params(), *parts_of_policy]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         optimizers = [

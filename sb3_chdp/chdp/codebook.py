@@ -58,9 +58,9 @@ class Codebook(nn.Module):
 
     def alternatives(self, k: th.Tensor, n: int, repeatable: bool) -> th.Tensor:
         """
-        Other discrete actions to try.
+        Discrete actions to try beside others.
 
-        :param k: (B,) discrete actions
+        :param k: (B,) the others, which are not left out
         :param n: number of alternatives to each; beyond K they repeat
         :param repeatable: whether to return the same ones always
         :return: (B, n) successive discrete actions from a random one on; if ``repeatable``, evenly spread ones

@@ -21,7 +21,7 @@ LATENT_NORM = 2.0
 
 class AttentionReads(nn.Module):
     """
-    What a latent e reads of the features x: ``n_reads`` means of their entries, weighted by softmax(W_j e + b_j).
+    What a latent e reads of the features x: ``n_reads`` means of their entries, weighted by softmax(3 (W_j e + b_j)).
 
     A discrete action often concerns a part of the state, its channel or its product. An MLP on [x, e] has to learn for each
     action which part that is, and hardly carries it over to new states; attention picks entries out.

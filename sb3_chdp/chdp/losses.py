@@ -113,6 +113,25 @@ def return_loss(policy: CHDPPolicy, replay_data: HybridReplaySamples, features: 
     return (replay_data.weights * (summands - errors).square()).mean()
 
 
+def losses_beside_critics(
+    policy: CHDPPolicy, replay_data: HybridReplaySamples, features: th.Tensor, targets: th.Tensor, q1: th.Tensor
+) -> dict[str, th.Tensor]:
+    """
+    Losses of the rewards alone, for foresight, and of what returns add to values, for targets.
+
+    :param policy: the networks
+    :param replay_data: a batch
+    :param features: (B, features_dim) features of the observations, without gradient
+    :param targets: (B, 2) values and rewards in the units of the critics
+    :param q1: (B, 1) values of the first critic, without gradient
+    :return: losses by name
+    """
+    losses = {"reward_loss": reward_loss(policy, replay_data, features, targets[:, 1:])}
+    if replay_data.returns is not None:
+        losses["return_loss"] = return_loss(policy, replay_data, features, targets[:, :1] - q1)
+    return losses
+
+
 def first_occurrences(k: th.Tensor) -> th.Tensor:
     """
     :param k: (B, n) discrete actions, (B, n, L) of a factored space

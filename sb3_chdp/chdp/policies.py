@@ -174,7 +174,7 @@ class CHDPPolicy(HybridPolicy):
         n_values = sum(spec.radices)
 
         def alternatives(n_most: int) -> dict[str, Any]:
-            return {"n_changed" if spec.is_factored else "n_uniform": min(n_values, n_most)}
+            return {"n_changed" if spec.is_factored else "n_alternatives": min(n_values, n_most)}
 
         acting = Selection(self.n_action_candidates, n_random=N_RANDOM_CANDIDATES, **alternatives(MAX_ALTERNATIVES))
         n_others = n_values if n_values < N_NEXT_ACTIONS else N_NEXT_ACTIONS // 2
@@ -224,12 +224,12 @@ class CHDPPolicy(HybridPolicy):
 
     def _fixed_draws(self, observation: PyTorchObs) -> FixedDraws:
         """:return: what deterministic predictions take for all that is random, the same for every model"""
-        n_drawn, n_uniform = self.select_deterministic.n_drawn, self.select_deterministic.n_uniform
+        n_drawn, n_alternatives = self.select_deterministic.n_drawn, self.select_deterministic.n_alternatives
         latent_noise, parameter_noise = (
             repeatable_noise(observation, n, model.n_steps, model.dim, seed=seed).flatten(0, 1).transpose(0, 1)
             for n, model, seed in (
                 (n_drawn, self.actor_target.discrete_policy, 1),
-                (n_drawn + n_uniform, self.actor_target.continuous_policy, 2),
+                (n_drawn + n_alternatives, self.actor_target.continuous_policy, 2),
             )
         )
         return FixedDraws(latent_noise, parameter_noise, self.fixed_discrete_actions, self.fixed_parameters)

@@ -51,7 +51,7 @@ class ProductCodebook(ProductTable):
 
     def alternatives(self, k: th.Tensor, n: int, repeatable: bool) -> th.Tensor:
         """
-        Other discrete actions to try, which differ from the given ones in a single choice.
+        Other discrete actions to try, which differ from the given ones in one choice at most.
 
         :param k: (B, L) discrete actions
         :param n: number of alternatives to each, at most the sum of the radices

@@ -3,6 +3,7 @@
 from typing import Any
 
 import optuna
+from rl_zoo3.hyperparams_opt import convert_offpolicy_params
 
 NET_ARCHS = {
     "small": {"pi": [64, 64], "qf": [128, 128]},
@@ -16,12 +17,10 @@ def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     :param sampled_params: the raw parameters of a trial
     :return: arguments of CHDP
     """
-    hyperparams = sampled_params.copy()
-    hyperparams["gamma"] = 1 - hyperparams.pop("one_minus_gamma")
-    for name in ("batch_size", "latent_dim", "gradient_steps"):
+    hyperparams: dict[str, Any] = convert_offpolicy_params(sampled_params)
+    for name in ("latent_dim", "gradient_steps"):
         hyperparams[name] = 2 ** hyperparams.pop(f"{name}_pow")
-    net_arch = NET_ARCHS[hyperparams.pop("net_arch")]
-    hyperparams["policy_kwargs"] = {"net_arch": net_arch}
+    hyperparams["policy_kwargs"] = {"net_arch": NET_ARCHS[sampled_params["net_arch"]]}
     return hyperparams
 
 

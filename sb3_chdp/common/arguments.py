@@ -77,6 +77,7 @@ NOT_NEGATIVE = Accepted("a finite number of at least 0", lambda value: is_number
 POSITIVE = Accepted("a finite number above 0", lambda value: is_number(value) and value > 0)
 FRACTION = Accepted("a number between 0 and 1", lambda value: is_number(value) and 0 <= value <= 1)
 SWITCH = Accepted("True or False", lambda value: isinstance(value, (bool, np.bool_)))
+A_DICT = Accepted("a dict", lambda value: isinstance(value, dict))
 RATE = scheduled(NOT_NEGATIVE)
 SEED = optional(whole(0, 2**32 - 1))
 TRAIN_FREQ = Accepted('a whole number of at least 1, alone or in a tuple with "step" or "episode"', _is_train_freq)

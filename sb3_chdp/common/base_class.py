@@ -73,7 +73,7 @@ class HybridAlgorithm(BaseAlgorithm):
     action_layout: str
     hybrid_space: HybridBox
     # Whether rows may have a column for every discrete choice, or only one for the joint index of all
-    takes_factored: ClassVar[bool] = False
+    takes_factored: ClassVar[bool] = True
     # Whether the environment is asked for the discrete actions that it allows; None: as long as none has said whether it can
     use_masking: bool | None = None
     # An array or a dict of arrays, which SB3's own annotations hand on where one of them is accepted
@@ -147,7 +147,7 @@ class HybridAlgorithm(BaseAlgorithm):
         :param action_layout: how to read an ambiguous action space
         :return: the space of the rows that buffer and networks work with
         """
-        return HybridBox(self.action_space, action_layout)
+        raise NotImplementedError
 
     def _choose_hybrid_space(self) -> HybridBox:
         """:return: what :meth:`_make_hybrid_space` makes, with one index for algorithms that need it"""
@@ -263,7 +263,9 @@ class HybridAlgorithm(BaseAlgorithm):
     def _setup_learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         # Less than 0 if a training that goes on is through already
         check(Accepted("a finite number", is_number), total_timesteps=total_timesteps)
-        if self.use_masking is not False and self.env is not None and is_masking_supported(self.env) != bool(self.use_masking):
+        if self.env is None:
+            raise ValueError("The model has no environment to learn from: set_env() gives it one, or load(..., env=...)")
+        if self.use_masking is not False and is_masking_supported(self.env) != bool(self.use_masking):
             if self.use_masking:
                 raise ValueError("use_masking is True but the environment has no method action_masks()")
             warnings.warn(
@@ -272,7 +274,6 @@ class HybridAlgorithm(BaseAlgorithm):
             )
         with uncounted_if_refused(self._vec_normalize_env):
             total_timesteps, callback = super()._setup_learn(total_timesteps, *args, **kwargs)
-            assert self.env is not None, "You must set the environment before calling learn()"
             try:
                 self.row_env(self.env).check_observations(self._last_obs)
             except ValueError:

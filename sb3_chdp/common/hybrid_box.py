@@ -135,9 +135,9 @@ class ConcatenatedBox(HybridBox):
 
 class ScoreBox(ConcatenatedBox):
     """
-    The space [-1, 1]^(K + P) of rows ``[scores | scaled parameters of all actions]``, for algorithms whose actor gives a
-    score to every discrete action, of which the highest decides; in a factored space to every value of every choice, and the
-    highest of each decides.
+    The space of rows ``[scores | scaled parameters of all actions]``, all in [-1, 1], for algorithms whose actor gives a score
+    to every discrete action, of which the highest decides; in a factored space to every value of every choice, and the highest
+    of each decides.
 
     The arguments are those of :class:`ConcatenatedBox`.
     """

@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_chdp.common.arguments import (
+    A_DICT,
     FRACTION,
     SWITCH,
     TRAIN_FREQ,
@@ -30,6 +31,7 @@ from sb3_chdp.common.arguments import (
 from sb3_chdp.common.base_class import HYBRID_SPACES, HybridAlgorithm
 from sb3_chdp.common.buffer_file import check_buffer, load_buffer, save_buffer
 from sb3_chdp.common.checks import check_numbers, check_replayed_observations, warn_of_memory
+from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.masks import last_masks
 from sb3_chdp.common.n_step_buffer import TELLS_LAST, n_step_settings
 from sb3_chdp.common.policies import HybridPolicy
@@ -38,6 +40,7 @@ from sb3_chdp.common.rows import MASK_PARTS, pack_bits
 from sb3_chdp.common.safe_zip import refuse
 from sb3_chdp.common.samples import HybridReplaySamples, name_columns
 from sb3_chdp.common.trajectories import end_trajectories
+from sb3_chdp.common.utils import TargetUpdate
 
 SelfHybridOffPolicyAlgorithm = TypeVar("SelfHybridOffPolicyAlgorithm", bound="HybridOffPolicyAlgorithm")
 
@@ -64,9 +67,14 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         "policy_delay": whole(1),
         "action_noise": optional(Accepted("an ActionNoise of SB3's", lambda value: isinstance(value, ActionNoise))),
         "replay_buffer_class": optional(Accepted("a class of replay buffers", lambda value: is_class_of(value, ReplayBuffer))),
-        "replay_buffer_kwargs": optional(Accepted("a dict", lambda value: isinstance(value, dict))),
+        "replay_buffer_kwargs": optional(A_DICT),
     }
     policy: HybridPolicy
+    # Those of the policy
+    actor: Any
+    actor_target: Any
+    critic: Any
+    critic_target: Any
 
     def __init__(
         self,
@@ -106,6 +114,12 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
             self.replay_buffer_class, self.replay_buffer_kwargs = given
         assert self.replay_buffer is not None
         warn_of_memory(self.replay_buffer)
+        self._create_aliases()
+        self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
+
+    def _create_aliases(self) -> None:
+        self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
+        self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
 
     def learn(
         self: SelfHybridOffPolicyAlgorithm,
@@ -296,6 +310,13 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
     def _on_step(self) -> None:
         super()._on_step()
         self.logger.record("rollout/exploration_rate", self._exploration_rate())
+
+    def _excluded_save_params(self) -> list[str]:
+        parts_of_policy = ["actor", "critic", "actor_target", "critic_target", "update_targets"]
+        return [*super()._excluded_save_params(), *parts_of_policy]
+
+    def _make_hybrid_space(self, action_layout: str) -> HybridBox:
+        return HybridBox(self.action_space, action_layout, state_parts=self._state_parts())
 
     def _state_parts(self) -> tuple[str, ...]:
         """:return: what rows hold about the states before and after an action"""

@@ -69,7 +69,7 @@ class ReplayStore:
 
     def __init__(self, chunk_bytes: int) -> None:
         self.chunk_bytes = chunk_bytes
-        #: rows added to the buffer since ``forget()``, to be counted by the owner
+        #: rows added to the buffer so far, to be counted by the owner
         self.n_added = 0
         self._buffer: ReplayBuffer | None = None
         self._written: list[Written] = []

@@ -16,10 +16,10 @@ class HybridReplaySamples(NamedTuple):
 
     Shapes: actions (B, columns), the rows without masks and returns; of these discrete_actions (B,) int64, parameters
     (B, Pmax) in [-1, 1] with padding 0, or (B, P) those of all actions, latents (B, latent_dim), which may be 0 columns;
-    rewards, dones, discounts and weights (B, 1); indices say where a prioritised buffer stores them; masks and next_masks
-    (B, K) boolean, which discrete actions the environment allowed in the state and in the next one, None without masking;
-    returns and next_returns (B, 1), the sum of the episode's rewards before the action and with its reward, None if rows hold
-    none. In a factored space discrete_actions are (B, L) and masks (B, sum of the radices).
+    rewards, dones, and with n-step returns discounts (B, 1); weights (B, 1) of a prioritised buffer and indices, where it
+    stores them; masks and next_masks (B, K) boolean, which discrete actions the environment allowed in the state and in the
+    next one, None without masking; returns and next_returns (B, 1), the sum of the episode's rewards before the action and
+    with its reward, None if rows hold none. In a factored space discrete_actions are (B, L) and masks (B, sum of the radices).
     """
 
     observations: PyTorchObs

@@ -121,7 +121,7 @@ def collect_discrete(space: spaces.Space[Any]) -> list[DiscreteLeaf]:
                 "MultiBinary and Box parts, or is a OneOf of Box parts as a whole"
             )
     if not leaves:
-        raise ValueError(f"{space} has no discrete part: use an algorithm for Box actions, e.g. SAC or TD3")
+        raise ValueError(f"{space} has no discrete part: as one Box SB3's SAC takes it")
     return leaves
 
 

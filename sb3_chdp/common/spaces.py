@@ -1,5 +1,6 @@
 """Hybrid action spaces: the only module, with ``space_tree``, that knows how users spell them."""
 
+import math
 import pickle
 from collections.abc import Iterator
 from copy import copy
@@ -64,6 +65,7 @@ class HybridActionSpec:
         check(one_of(LAYOUTS), action_layout=layout)
         self.space = space
         self.layout = layout
+        self._is_one_of = isinstance(space, spaces.OneOf)
         if isinstance(space, spaces.OneOf):
             if layout not in ("auto", "per_action"):
                 raise ValueError(f"action_layout={layout!r} does not apply to a OneOf space, whose parts exclude each other")
@@ -73,34 +75,30 @@ class HybridActionSpec:
                         f"action_space.spaces[{i}] of a OneOf must hold Box spaces only, or be Discrete(1) for no "
                         f"parameters, got {option}"
                     )
-            self._discrete_leaves: list[DiscreteLeaf] = []
-            options: list[tuple[Path, spaces.Space[Any]]] = [(("option",), option) for option in space.spaces]
-            self.is_shared = False
-        elif isinstance(space, (spaces.Tuple, spaces.Dict)):
-            choice = find_options(space) if layout in ("auto", "per_action") else None
-            if choice is None and layout == "per_action":
-                raise ValueError(
-                    f"action_layout='per_action' needs a Discrete(K) and exactly K parameter spaces at the top, got {space}"
-                )
-            self.is_shared = choice is None
-            if choice is None:
-                self._discrete_leaves = collect_discrete(space)
-                options = [((), space)]
-            else:
-                discrete_path, options = choice
-                discrete_space = get_part(space, discrete_path)
-                self._discrete_leaves = [DiscreteLeaf(discrete_path, discrete_space, *digits_of(discrete_space))]
-        else:
+            # Read as one box per action; of its native actions only the chosen part is handed out
+            space = spaces.Tuple((spaces.Discrete(len(space.spaces)), spaces.Tuple(space.spaces)))
+        elif not isinstance(space, (spaces.Tuple, spaces.Dict)):
             raise ValueError(
                 f"The action space must be a Tuple, Dict or OneOf with a discrete and a continuous part, got {space}"
             )
+        choice = find_options(space) if layout in ("auto", "per_action") else None
+        if choice is None and layout == "per_action":
+            raise ValueError(
+                f"action_layout='per_action' needs a Discrete(K) and exactly K parameter spaces at the top, got {space}"
+            )
+        self.is_shared = choice is None
+        if choice is None:
+            self._discrete_leaves = collect_discrete(space)
+            options: list[tuple[Path, spaces.Space[Any]]] = [((), space)]
+        else:
+            discrete_path, options = choice
+            discrete_space = get_part(space, discrete_path)
+            self._discrete_leaves = [DiscreteLeaf(discrete_path, discrete_space, *digits_of(discrete_space))]
+        self._template_space = space
 
         #: numbers of values of all digits of the discrete leaves
         self.digits = tuple(radix for leaf in self._discrete_leaves for radix in leaf.radices)
-        # Python integers: the product of many radices may overflow int64
-        n_joint = len(options) if not self._discrete_leaves else 1
-        for radix in self.digits:
-            n_joint *= radix
+        n_joint = math.prod(self.digits)
         can_factor = self.is_shared and len(self.digits) > 1
         if layout == "factored" and not can_factor:
             raise ValueError(f"action_layout='factored' needs several discrete parts, got {space}")
@@ -111,26 +109,19 @@ class HybridActionSpec:
             )
             raise ValueError(
                 f"{n_joint} joint discrete actions are more than the {MAX_DISCRETE_ACTIONS} supported; {hint} has no limit, "
-                f"in {space}"
+                f"in {self.space}"
             )
         self.n_discrete_actions = n_joint
         #: numbers of values of the choices that a row makes: a single one, K, unless the space is factored
         self.radices: tuple[int, ...] = self.digits if self.is_factored else (n_joint,)
-        if isinstance(space, spaces.OneOf):
-            self._boxes = [collect_boxes(part, path, f"action_space.spaces[{i}]") for i, (path, part) in enumerate(options)]
-        else:
-            self._boxes = [collect_boxes(part, path) for path, part in options]
-        self._templates = self._make_templates(0.0)
+        names = [f"action_space.spaces[{i}]" if self._is_one_of else None for i in range(len(options))]
+        self._boxes = [collect_boxes(part, path, name) for (path, part), name in zip(options, names, strict=True)]
+        self._template = self._make_template(0.0)
         self._build_tables()
 
-    def _make_templates(self, place: float) -> list[bytes]:
-        if isinstance(self.space, spaces.OneOf):
-            # The part of the native action behind the index lives under the key "option" while it is being built
-            templates: list[Any] = [{"option": template_action(option, place)} for option in self.space.spaces]
-        else:
-            templates = [template_action(self.space, place)]
+    def _make_template(self, place: float) -> bytes:
         # Pickled: to load one is the fastest way to copy it, and every action has arrays of its own, which may be changed
-        return [pickle.dumps(template) for template in templates]
+        return pickle.dumps(template_action(self._template_space, place))
 
     def leaving_others_at(self, place: float) -> "HybridActionSpec":
         """
@@ -139,7 +130,7 @@ class HybridActionSpec:
             the middle
         """
         spec = copy(self)
-        spec._templates = self._make_templates(place)
+        spec._template = self._make_template(place)
         return spec
 
     def _build_tables(self) -> None:
@@ -148,7 +139,7 @@ class HybridActionSpec:
         self.max_parameters = max(sizes)
         self.columns = RowLayout(discrete_actions=len(self.radices), parameters=self.max_parameters)
         if self.max_parameters == 0:
-            raise ValueError(f"{self.space} has no continuous part: use an algorithm for discrete actions, e.g. DQN or PPO")
+            raise ValueError(f"{self.space} has no continuous part: as a Discrete or MultiDiscrete SB3's PPO takes it")
         n_options = len(self._boxes)
         mask = np.zeros((n_options, self.max_parameters), dtype=bool)
         centre, half = np.zeros(mask.shape), np.zeros(mask.shape)
@@ -181,7 +172,7 @@ class HybridActionSpec:
     @property
     def n_mask_values(self) -> int:
         """Length of the masks of all discrete parts one after the other: the sum of their numbers of values."""
-        return sum(self.digits) or self.n_discrete_actions
+        return sum(self.digits)
 
     def join_masks(self, masks: np.ndarray) -> np.ndarray:
         """
@@ -240,11 +231,11 @@ class HybridActionSpec:
 
     def _assemble(self, k: Any, values: np.ndarray) -> Any:
         option = 0 if self.is_shared else int(k)
-        native = pickle.loads(self._templates[option if isinstance(self.space, spaces.OneOf) else 0])
+        native = pickle.loads(self._template)
         for box in self._boxes[option]:
             native = replace_part(native, box.path, cast_to_box(values[box.columns], box.space))
-        if isinstance(self.space, spaces.OneOf):
-            return np.int64(k), native["option"]
+        if self._is_one_of:
+            return np.int64(k), native[1][option]
         for leaf, digits in zip(self._discrete_leaves, self._split_index(k), strict=True):
             native = replace_part(native, leaf.path, self._native_digits(leaf, digits))
         return native
@@ -278,17 +269,15 @@ class HybridActionSpec:
         :return: (columns.width,) float64 ``[k | scaled parameters]``, padding 0
         :raises ValueError: for a discrete value or a parameter outside of its range
         """
-        given, digits = action, self.digits
-        if isinstance(self.space, spaces.OneOf):
-            k, digits = np.array([int(action[0])]), (self.n_discrete_actions,)
-            action = {"option": action[1]}
-        else:
-            k = np.concatenate([np.ravel(get_part(action, leaf.path)) - leaf.start for leaf in self._discrete_leaves])
-            k = k.astype(np.int64)
-        if not ((k >= 0) & (k < digits)).all():
+        given = action
+        if self._is_one_of:
+            action = (action[0], {int(action[0]): action[1]})
+        k = np.concatenate([np.ravel(get_part(action, leaf.path)) - leaf.start for leaf in self._discrete_leaves])
+        k = k.astype(np.int64)
+        if not ((k >= 0) & (k < self.digits)).all():
             raise ValueError(f"action must be in {self.space}, got {given!r}")
         if not self.is_factored:
-            k = np.array([np.ravel_multi_index(tuple(k), digits)])
+            k = np.array([np.ravel_multi_index(tuple(k), self.digits)])
         option = 0 if self.is_shared else int(k[0])
         parameters = np.zeros(self.max_parameters)
         for box in self._boxes[option]:

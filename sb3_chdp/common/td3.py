@@ -14,13 +14,13 @@ from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_chdp.common.arguments import FRACTION, NOT_NEGATIVE, SWITCH, Accepted, of_networks, optional
+from sb3_chdp.common.arguments import FRACTION, NOT_NEGATIVE, SWITCH, Accepted, is_class_of, of_networks, optional
 from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.hybrid_box import HybridBox, ScoreBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.policies import HybridPolicy
 from sb3_chdp.common.samples import HybridReplaySamples
-from sb3_chdp.common.utils import TargetUpdate, default_optimizer_kwargs, gradient_step
+from sb3_chdp.common.utils import default_optimizer_kwargs, gradient_step
 
 
 class _InvertGradient(th.autograd.Function):
@@ -152,6 +152,12 @@ class HybridTD3(HybridOffPolicyAlgorithm):
     """
 
     accepted_arguments: ClassVar[dict[str, Accepted]] = {
+        "replay_buffer_class": optional(
+            Accepted(
+                "a class of replay buffers without priorities, which only CHDP sets",
+                lambda kind: is_class_of(kind, ReplayBuffer) and not issubclass(kind, PrioritizedReplayBuffer),
+            )
+        ),
         "target_policy_noise": NOT_NEGATIVE,
         "target_noise_clip": NOT_NEGATIVE,
         "exploration_fraction": FRACTION,
@@ -167,7 +173,6 @@ class HybridTD3(HybridOffPolicyAlgorithm):
     # Twin networks, whose inputs are up to the subclasses
     critic: Any
     critic_target: Any
-    takes_factored = True
 
     def __init__(
         self,
@@ -251,21 +256,10 @@ class HybridTD3(HybridOffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        if isinstance(self.replay_buffer, PrioritizedReplayBuffer):
-            raise ValueError(
-                f"replay_buffer_class must not be {type(self.replay_buffer).__name__} for {type(self).__name__}, which would "
-                "never set a priority: CHDP does"
-            )
         initial_noise = self.exploration_noise if self.exploration_initial_noise is None else self.exploration_initial_noise
         fraction = max(self.exploration_fraction, 1e-9)  # a schedule divides by it
         self.exploration_schedule = LinearSchedule(self.exploration_initial_eps, self.exploration_final_eps, fraction)
         self.exploration_noise_schedule = LinearSchedule(initial_noise, self.exploration_noise, fraction)
-        self._create_aliases()
-        self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
-
-    def _create_aliases(self) -> None:
-        self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
-        self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
 
     def _exploration_rate(self) -> float:
         return self.exploration_schedule(self._current_progress_remaining)
@@ -331,10 +325,6 @@ class HybridTD3(HybridOffPolicyAlgorithm):
         """:return: the negative mean of Q1(s, pi(s))"""
         obs = replay_data.observations
         return -self.critic.q1_forward(obs, self.policy.actor_outputs(self.actor, obs, replay_data.masks)).mean()
-
-    def _excluded_save_params(self) -> list[str]:
-        parts_of_policy = ["actor", "critic", "actor_target", "critic_target", "update_targets"]
-        return [*super()._excluded_save_params(), *parts_of_policy]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []

@@ -3,8 +3,7 @@
 from typing import Any
 
 import optuna
-
-NET_ARCHS = {"small": [64, 64], "medium": [256, 256], "big": [400, 300]}
+from rl_zoo3.hyperparams_opt import convert_offpolicy_params
 
 
 def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
@@ -12,11 +11,8 @@ def convert_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     :param sampled_params: the raw parameters of a trial
     :return: arguments of the algorithm
     """
-    hyperparams = sampled_params.copy()
-    hyperparams["gamma"] = 1 - hyperparams.pop("one_minus_gamma")
-    for name in ("batch_size", "gradient_steps"):
-        hyperparams[name] = 2 ** hyperparams.pop(f"{name}_pow")
-    hyperparams["policy_kwargs"] = {"net_arch": NET_ARCHS[hyperparams.pop("net_arch")]}
+    hyperparams: dict[str, Any] = convert_offpolicy_params(sampled_params)
+    hyperparams["gradient_steps"] = 2 ** hyperparams.pop("gradient_steps_pow")
     return hyperparams
 
 
@@ -41,6 +37,6 @@ def sample_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_a
         "exploration_noise": trial.suggest_float("exploration_noise", 0.05, 0.5),
         "exploration_fraction": trial.suggest_float("exploration_fraction", 0.05, 0.5),
         "inverting_gradients": trial.suggest_categorical("inverting_gradients", [False, True]),
-        "net_arch": trial.suggest_categorical("net_arch", list(NET_ARCHS)),
+        "net_arch": trial.suggest_categorical("net_arch", ["small", "medium", "big"]),
     }
     return convert_params(sampled_params)

@@ -6,7 +6,6 @@ from itertools import islice
 from typing import Any
 
 import torch as th
-from stable_baselines3.common.utils import get_parameters_by_name
 from torch import nn
 
 # Rows of a table that are searched at a time, and size of the groups that are told apart first; one divides the other
@@ -33,7 +32,8 @@ class TargetUpdate:
     def _tensors(networks: Sequence[nn.Module]) -> tuple[list[th.Tensor], list[th.Tensor]]:
         """:return: parameters, each once, and running statistics"""
         params: dict[th.Tensor, None] = dict.fromkeys(p for net in networks for p in net.parameters())
-        return list(params), [stat for net in networks for stat in get_parameters_by_name(net, ["running_"])]
+        # The buffers themselves, not views of them as in a state_dict, which a pickle would part from the networks
+        return list(params), [stat for net in networks for name, stat in net.named_buffers() if "running_" in name]
 
     @th.no_grad()
     def __call__(self, tau: float) -> None:

@@ -1,6 +1,5 @@
 """What the environments share: decoding of actions, reset options, noise draws, states and pictures."""
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
@@ -12,7 +11,7 @@ from sb3_chdp.common.arguments import is_number
 if TYPE_CHECKING:
     from sb3_chdp.envs.rendering import Canvas
 
-# Frames after which a step is cut off; never seen
+# Frames after which a step of Goal is cut off; never seen
 FRAME_LIMIT = 10_000
 
 
@@ -42,8 +41,6 @@ class HybridEnv(gym.Env[np.ndarray, Any]):
             raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
         self.noise = noise
         self.render_mode = render_mode
-        #: called without arguments after resets, after every frame inside a step, and after an end without a frame
-        self.frame_callback: Callable[[], Any] | None = self.render if render_mode == "human" else None
         self._canvas: Canvas | None = None
         self._pictures: list[np.ndarray] | None = None
         self._pictures_wanted = False
@@ -197,15 +194,15 @@ class HybridEnv(gym.Env[np.ndarray, Any]):
 
     @property
     def _is_watched(self) -> bool:
-        return self.frame_callback is not None or self._pictures is not None
+        return self.render_mode == "human" or self._pictures is not None
 
     def _frame_done(self, outcome: str) -> None:
         """Show a frame to whoever watches; to be called after each, its outcome known."""
         self._outcome = outcome
         if self._pictures is not None:
             self._pictures += [self._picture()] * (1 + self.metadata["render_fps"] // 2 * bool(outcome))
-        if self.frame_callback is not None:
-            self.frame_callback()
+        if self.render_mode == "human":
+            self.render()
 
     def _action_text(self) -> str:
         """:return: name and parameters of the last action"""

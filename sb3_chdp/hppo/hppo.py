@@ -10,15 +10,14 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 from torch.autograd.graph import register_multi_grad_hook
 
 from sb3_chdp.common.arguments import (
+    A_DICT,
     FRACTION,
     NOT_NEGATIVE,
     POSITIVE,
@@ -123,9 +122,9 @@ class HPPO(HybridAlgorithm, PPO):
         "vf_coef": NOT_NEGATIVE,
         "max_grad_norm": POSITIVE,
         "target_kl": optional(POSITIVE),
+        "rollout_buffer_kwargs": optional(A_DICT),
     }
     policy: HPPOPolicy
-    takes_factored = True
 
     def __init__(
         self,
@@ -211,46 +210,16 @@ class HPPO(HybridAlgorithm, PPO):
                 f"{buffer_size} is no multiple of batch_size={self.batch_size}"
             )
 
-    def collect_rollouts(
-        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
-    ) -> bool:
+    def collect_rollouts(self, env: VecEnv, *args: Any, **kwargs: Any) -> bool:
         """SB3's ``collect_rollouts``, with masks for the policy and rows that the environment gets as native actions."""
-        assert self._last_obs is not None and self._last_episode_starts is not None, "No previous observation was provided"
-        row_env = self.row_env(env)
-        self.policy.set_training_mode(False)
-        rollout_buffer.reset()
-        callback.on_rollout_start()
-
-        for _ in range(n_rollout_steps):
-            with th.no_grad():
-                obs_tensor = obs_as_tensor(self._last_obs, self.device)
-                row_tensor, values, log_probs = self.policy(obs_tensor, action_masks=self._action_masks())
-            actions = row_tensor.cpu().numpy()
-            new_obs, rewards, dones, infos = row_env.step(actions)
-            self.num_timesteps += env.num_envs
-            callback.update_locals(locals())
-            if not callback.on_step():
-                self._last_obs = None  # the step is not stored: learning begins with a reset again
-                return False
-
-            self._update_info_buffer(infos, dones)
-            for i in np.flatnonzero(dones):
-                terminal_obs = infos[i].get("terminal_observation")
-                # Time limits bootstrap
-                if terminal_obs is not None and infos[i].get("TimeLimit.truncated", False):
-                    terminal_obs = self.policy.obs_to_tensor(terminal_obs)[0]
-                    with th.no_grad():
-                        rewards[i] += self.gamma * self.policy.predict_values(terminal_obs).item()
-            rollout_buffer.add(self._last_obs, actions, rewards, self._last_episode_starts, values, log_probs)
-            self._last_obs = new_obs
-            self._last_episode_starts = dones
-
-        with th.no_grad():
-            values = self.policy.predict_values(obs_as_tensor(self._last_obs, self.device))
-        rollout_buffer.compute_returns_and_advantage(last_values=values, dones=dones)
-        callback.update_locals(locals())
-        callback.on_rollout_end()
-        return True
+        self.policy.rollout_masks = self._action_masks
+        try:
+            goes_on = super().collect_rollouts(self.row_env(env), *args, **kwargs)
+        finally:
+            self.policy.rollout_masks = None
+        if not goes_on:
+            self._last_obs = None  # the last step is not stored: learning begins with a reset again
+        return goes_on
 
     def train(self) -> None:
         """PPO's: log-probabilities have two columns, so the discrete action and its parameters have a ratio each."""

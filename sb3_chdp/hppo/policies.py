@@ -1,7 +1,9 @@
 """Policies of HPPO: SB3's actor-critic policy with a hybrid distribution."""
 
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch as th
 from sb3_contrib.common.maskable.distributions import MaybeMasks
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
@@ -22,6 +24,8 @@ class HPPOPolicy(HybridPolicy, ActorCriticPolicy):
 
     action_space: ConcatenatedBox
     action_dist: HybridDistribution
+    # What allows actions in rollouts, where SB3 hands no masks on
+    rollout_masks: Callable[[], np.ndarray | None] | None = None
 
     def __init__(self, *args: Any, **kwargs: Any):
         net_arch = kwargs.get("net_arch")
@@ -49,7 +53,7 @@ class HPPOPolicy(HybridPolicy, ActorCriticPolicy):
         values = self.value_net(self.mlp_extractor.forward_critic(vf_features))
         distribution = self._get_action_dist_from_latent(self.mlp_extractor.forward_actor(pi_features))
         assert isinstance(distribution, HybridDistribution)
-        distribution.apply_masking(action_masks)
+        distribution.apply_masking(action_masks if self.rollout_masks is None else self.rollout_masks())
         rows = distribution.get_actions(deterministic=deterministic)
         return rows, values, distribution.log_prob(rows)
 

@@ -70,6 +70,8 @@ class HyARTD3(HybridTD3):
         "MultiInputPolicy": MultiInputPolicy,
     }
     accepted_arguments: ClassVar[dict[str, Accepted]] = {
+        # Such a buffer gives the first state of the next episode for what follows the last action of one
+        "optimize_memory_usage": Accepted("False, HyARTD3 needs all next states", lambda value: value in (False,)),
         "embedding_dim": of_networks(whole(1)),
         "parameter_latent_dim": of_networks(whole(1)),
         "representation_learning_rate": RATE,
@@ -131,11 +133,6 @@ class HyARTD3(HybridTD3):
         return {**super()._network_kwargs(), "embedding_dim": self.embedding_dim}
 
     def _setup_model(self) -> None:
-        if self.optimize_memory_usage is True:
-            raise ValueError(
-                "optimize_memory_usage must be False for HyARTD3, got True: the representation learns from what follows an "
-                "action, and such a buffer gives the first state of the next episode for what follows the last one"
-            )
         super()._setup_model()
         self.representation_lr_schedule = FloatSchedule(self.representation_learning_rate)
 

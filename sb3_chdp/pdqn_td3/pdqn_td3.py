@@ -7,7 +7,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_chdp.common.arguments import RATE, SWITCH, Accepted, of_networks, optional
+from sb3_chdp.common.arguments import A_DICT, RATE, SWITCH, Accepted, of_networks, optional
 from sb3_chdp.common.hybrid_box import ConcatenatedBox, HybridBox
 from sb3_chdp.common.samples import HybridReplaySamples
 from sb3_chdp.common.td3 import HybridTD3
@@ -64,7 +64,7 @@ class PDQNTD3(HybridTD3):
     accepted_arguments: ClassVar[dict[str, Accepted]] = {
         "actor_learning_rate": RATE,
         "multi_pass": of_networks(SWITCH),
-        "passthrough": of_networks(optional(Accepted("a dict", lambda value: isinstance(value, dict)))),
+        "passthrough": of_networks(optional(A_DICT)),
     }
     policy: PDQNTD3Policy
     critic: ParameterizedQNetwork
