@@ -115,11 +115,12 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         assert self.replay_buffer is not None
         warn_of_memory(self.replay_buffer)
         self._create_aliases()
-        self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
 
     def _create_aliases(self) -> None:
+        """Name the parts of the policy; to be overridden where it has others than an actor, critics and their targets."""
         self.actor, self.actor_target = self.policy.actor, self.policy.actor_target
         self.critic, self.critic_target = self.policy.critic, self.policy.critic_target
+        self.update_targets = TargetUpdate([self.actor, self.critic], [self.actor_target, self.critic_target])
 
     def learn(
         self: SelfHybridOffPolicyAlgorithm,
