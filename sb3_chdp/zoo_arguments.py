@@ -153,6 +153,7 @@ def complete(command: str, arguments: list[str]) -> list[str]:
     names = READERS[command]
     folder, algo, env = (option(arguments, *of) for of in (names.folder, names.algo, names.env))
     is_plot = not names.exp_id
+    exp_id = None if is_plot else option(arguments, *names.exp_id)
     if HELP & set(arguments) or (folder is not None and (command == "all_plots" or env is not None)):
         return arguments
     # Not the folders that a tuning leaves behind; those with checkpoints alone if the user asks for one
@@ -163,11 +164,13 @@ def complete(command: str, arguments: list[str]) -> list[str]:
     newest: tuple[float, Path] | None = None
     for file in files:
         env_name, _, number = file.parent.name.rpartition("_")
-        if number.isdigit() and (_has_episodes(file) if is_plot else any_file or file.stem == env_name):
+        is_meant = number.isdigit() and exp_id in (None, "0", "-1", number)
+        if is_meant and (_has_episodes(file) if is_plot else any_file or file.stem == env_name):
             newest = max(newest or (0.0, file.parent), (file.stat().st_mtime, file.parent))
     if newest is None:
         kind = "run with a finished episode" if is_plot else "run" if any_file else "finished run"
-        words = ["no", kind, f"of {algo}" if algo else "", f"on {env}" if env else "", "in"]
+        of_run = f"of {algo}" if algo else "", f"on {env}" if env else "", f"with --exp-id {exp_id}" if exp_id else ""
+        words = ["no", kind, *of_run, "in"]
         raise ArgumentsError(f"{' '.join(filter(None, words))} {folder or LOGS}; -f names another folder")
     run = newest[1]
     env_name, _, number = run.name.rpartition("_")
@@ -176,7 +179,7 @@ def complete(command: str, arguments: list[str]) -> list[str]:
         added += [names.algo[0], run.parent.name]
     if env is None:
         added += [names.env[0], next((known for known in gym.registry if folder_name(known) == env_name), env_name)]
-    if names.exp_id and option(arguments, *names.exp_id) is None:
+    if not is_plot and exp_id is None:
         added += [names.exp_id[0], number]
     return [*added, *arguments]
 

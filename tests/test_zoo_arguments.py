@@ -66,6 +66,7 @@ def test_the_last_run(logs, command, arguments, added):
         ("record", "--env sb3_chdp/Platform-v0", "no finished run on sb3_chdp/Platform-v0 in logs"),
         ("plot", "--env Other-v0", "no run with a finished episode on Other-v0 in logs"),
         ("enjoy", "--folder elsewhere", "no finished run in elsewhere"),
+        ("enjoy", "--env Goal-v0 --exp-id 2", "no finished run on Goal-v0 with --exp-id 2 in logs"),
         ("plot", "-f elsewhere", "no run with a finished episode in elsewhere"),
     ],
 )
