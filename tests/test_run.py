@@ -143,7 +143,7 @@ def test_dict_and_image_observations(algorithm, policy, share_features_extractor
 )
 def test_off_policy_options(off_policy_algorithm, kwargs):
     if off_policy_algorithm is HyARTD3 and "optimize_memory_usage" in kwargs:
-        with pytest.raises(ValueError, match="optimize_memory_usage must be False for HyARTD3"):
+        with pytest.raises(ValueError, match="optimize_memory_usage must be False, HyARTD3 needs all next states"):
             make_model(off_policy_algorithm, make_layout_env(), **kwargs)
         return
     model = make_model(off_policy_algorithm, make_layout_env(), **kwargs)
