@@ -261,14 +261,15 @@ class CHDP(ExploringAlgorithm):
         for name, values in logs.items():
             self.logger.record(f"train/{name}", th.stack(values).mean().item())
         if "continuous_loss" in logs:
-            self._log_usage(k[round(self.uniform_fraction * batch_size) :])
+            self._log_usage(k)
 
     def _log_usage(self, k: th.Tensor) -> None:
         """
         Log how many discrete actions are in use, of a factored space the mean over its choices and that of every leaf.
 
-        :param k: discrete actions that the policy draws for a batch
+        :param k: discrete actions of :meth:`_actions_to_improve`, of which those that the policy drew count
         """
+        k = k[round(self.uniform_fraction * len(k)) :]
         leaves = self.hybrid_space.spec.choices_of_leaves
         for name, values in zip(("usage", "perplexity"), self.actor.codebook.usage(k), strict=True):
             self.logger.record(f"train/codebook_{name}", values.mean().item())
@@ -280,6 +281,7 @@ class CHDP(ExploringAlgorithm):
         return replay_data._replace(latents=self._latents(replay_data))
 
     def _start_values(self) -> None:
+        """Center and scale of the values, before the first update."""
         first = self._sample_batch(N_FIRST_SAMPLES)
         self.policy.value_scale.start(first.rewards, (1 - first.dones) * first.discounts)
 
