@@ -48,7 +48,6 @@ BAD = {
     "target_policy_noise": AT_LEAST_0,
     "target_noise_clip": AT_LEAST_0,
     "exploration_noise": AT_LEAST_0,
-    "exploration_initial_noise": AT_LEAST_0,
     "inverting_gradients": SWITCH,
     "actor_learning_rate": AT_LEAST_0,
     "multi_pass": SWITCH,
@@ -115,7 +114,7 @@ def test_a_gpu_that_is_not_there(algorithm, device, tmp_path):
     [dict(learning_rate=np.float32(1e-3)), dict(learning_rate=0), dict(gamma=1), dict(gamma=0.0), dict(seed=np.int64(3)),
      dict(device=th.device("cpu")), dict(max_grad_norm=0.1), dict(batch_size=np.int32(4)), dict(train_freq=(2, "episode")),
      dict(gradient_steps=-1), dict(gradient_steps=0), dict(tau=1.0), dict(exploration_fraction=0.0), dict(seed=None),
-     dict(learning_rate=lambda progress: 1e-3 * progress), dict(clip_range_vf=0.2), dict(exploration_initial_noise=1.0)],
+     dict(learning_rate=lambda progress: 1e-3 * progress), dict(clip_range_vf=0.2), dict(exploration_noise=1.0)],
     ids=lambda kwargs: "-".join(kwargs),
 )  # fmt: skip
 def test_good_values(algorithm, kwargs):

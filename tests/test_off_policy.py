@@ -1,11 +1,14 @@
 """What all off-policy algorithms must get right, whatever their actors look like."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_chdp import CHDP
@@ -58,13 +61,12 @@ def test_time_limits_bootstrap(off_policy_algorithm):
     assert not model.replay_buffer.sample(200).dones.any()
 
 
-@pytest.mark.parametrize("final, initial, expected", [(0.2, None, (0.2, 0.2, 0.2)), (0.1, 0.9, (0.9, 0.5, 0.1))])
+@pytest.mark.parametrize("noise, expected", [(0.2, (0.2, 0.2, 0.2)), (LinearSchedule(0.9, 0.1, 0.5), (0.9, 0.5, 0.1))])
 @pytest.mark.parametrize("name", [algorithm.__name__ for algorithm in OFF_POLICY_ALGORITHMS if algorithm is not CHDP])
-def test_exploration_noise_schedule(name, final, initial, expected):
+def test_exploration_noise_schedule(name, noise, expected, tmp_path):
     algorithm = next(algorithm for algorithm in OFF_POLICY_ALGORITHMS if algorithm.__name__ == name)
-    model = make_model(
-        algorithm, make_layout_env(), exploration_noise=final, exploration_initial_noise=initial, exploration_fraction=0.5
-    )
+    make_model(algorithm, make_layout_env(), exploration_noise=noise).save(tmp_path / "model")
+    model: Any = algorithm.load(tmp_path / "model")
     for progress, std in zip((1.0, 0.75, 0.2), expected, strict=True):
         assert model.exploration_noise_schedule(progress) == pytest.approx(std)
 

@@ -9,12 +9,12 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs, Schedule
-from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 from stable_baselines3.td3.policies import Actor, TD3Policy
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_chdp.common.arguments import FRACTION, NOT_NEGATIVE, SWITCH, Accepted, is_class_of, of_networks, optional
+from sb3_chdp.common.arguments import FRACTION, NOT_NEGATIVE, RATE, SWITCH, Accepted, is_class_of, of_networks, optional
 from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.hybrid_box import HybridBox, ScoreBox
 from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
@@ -145,9 +145,8 @@ class HybridTD3(HybridOffPolicyAlgorithm):
     :param exploration_initial_eps: initial probability of a uniformly random action
     :param exploration_final_eps: final probability of a uniformly random action
     :param exploration_noise: standard deviation of the Gaussian noise on the actor's output (scores and parameters,
-        parameters, or latents), if no ``action_noise`` is given
-    :param exploration_initial_noise: initial standard deviation, which falls linearly to ``exploration_noise`` over
-        ``exploration_fraction``; None: constant
+        parameters, or latents), if no ``action_noise`` is given; it can be a function of the current progress remaining
+        (from 1 to 0)
     :param inverting_gradients: whether the gradients at the actor's output are inverted
     """
 
@@ -163,8 +162,7 @@ class HybridTD3(HybridOffPolicyAlgorithm):
         "exploration_fraction": FRACTION,
         "exploration_initial_eps": FRACTION,
         "exploration_final_eps": FRACTION,
-        "exploration_noise": NOT_NEGATIVE,
-        "exploration_initial_noise": optional(NOT_NEGATIVE),
+        "exploration_noise": RATE,
         "inverting_gradients": of_networks(SWITCH),
     }
     policy: HybridTD3Policy
@@ -194,8 +192,7 @@ class HybridTD3(HybridOffPolicyAlgorithm):
         policy_delay: int = 2,
         target_policy_noise: float = 0.2,
         target_noise_clip: float = 0.5,
-        exploration_noise: float = 0.1,
-        exploration_initial_noise: float | None = None,
+        exploration_noise: float | Schedule = 0.1,
         inverting_gradients: bool = False,
         exploration_fraction: float = 0.2,
         exploration_initial_eps: float = 1.0,
@@ -239,7 +236,6 @@ class HybridTD3(HybridOffPolicyAlgorithm):
         self.target_noise_clip = target_noise_clip
         self.target_policy_noise = target_policy_noise
         self.exploration_noise = exploration_noise
-        self.exploration_initial_noise = exploration_initial_noise
         self.inverting_gradients = inverting_gradients
         self.exploration_fraction = exploration_fraction
         self.exploration_initial_eps = exploration_initial_eps
@@ -256,10 +252,9 @@ class HybridTD3(HybridOffPolicyAlgorithm):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        initial_noise = self.exploration_noise if self.exploration_initial_noise is None else self.exploration_initial_noise
         fraction = max(self.exploration_fraction, 1e-9)  # a schedule divides by it
         self.exploration_schedule = LinearSchedule(self.exploration_initial_eps, self.exploration_final_eps, fraction)
-        self.exploration_noise_schedule = LinearSchedule(initial_noise, self.exploration_noise, fraction)
+        self.exploration_noise_schedule = FloatSchedule(self.exploration_noise)
 
     def _exploration_rate(self) -> float:
         return self.exploration_schedule(self._current_progress_remaining)

@@ -43,7 +43,7 @@ class HyARTD3(HybridTD3):
         6. latent bounds have a least width;
         7. ``representation_steps`` batches after ``representation_freq`` gradient steps (there one batch per ten episodes);
         8. uniformly random actions with a decreasing probability (``exploration_*``) instead of noise that falls from 1.0
-           to 0.1 (``exploration_initial_noise=1.0`` and initial and final rate 0: the scripts);
+           to 0.1 (``exploration_noise=LinearSchedule(1.0, 0.1, 0.2)`` and initial and final rate 0: the scripts);
         9. plain policy gradients; ``inverting_gradients=True`` for inverted ones; no clipping of gradient norms, no
            additional update per episode.
 
