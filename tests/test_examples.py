@@ -16,6 +16,7 @@ FOLDER = ROOT / "examples"
 # Script to the package that it needs
 PACKAGES = {
     "sliding": None,
+    "cartpole": None,
     "shoot": "hybrid_shoot",
     "uav": "pyRDDLGym",
     "rover": "pyRDDLGym",
