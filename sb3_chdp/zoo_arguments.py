@@ -164,14 +164,15 @@ def complete(command: str, arguments: list[str]) -> list[str]:
     newest: tuple[float, Path] | None = None
     for file in files:
         env_name, _, number = file.parent.name.rpartition("_")
+        # rl_zoo3 takes the last run for 0, the folder of the algorithm itself for -1
         is_meant = number.isdigit() and exp_id in (None, "0", "-1", number)
         if is_meant and (_has_episodes(file) if is_plot else any_file or file.stem == env_name):
             newest = max(newest or (0.0, file.parent), (file.stat().st_mtime, file.parent))
     if newest is None:
         kind = "run with a finished episode" if is_plot else "run" if any_file else "finished run"
-        of_run = f"of {algo}" if algo else "", f"on {env}" if env else "", f"with --exp-id {exp_id}" if exp_id else ""
-        words = ["no", kind, *of_run, "in"]
-        raise ArgumentsError(f"{' '.join(filter(None, words))} {folder or LOGS}; -f names another folder")
+        asked = {"of": algo, "on": env, "with --exp-id": exp_id}
+        words = ["no", kind, *(f"{word} {value}" for word, value in asked.items() if value), f"in {folder or LOGS}"]
+        raise ArgumentsError(f"{' '.join(words)}; -f names another folder")
     run = newest[1]
     env_name, _, number = run.name.rpartition("_")
     added = [] if folder else [names.folder[0], LOGS]
