@@ -11,11 +11,13 @@ import torch as th
 from ablations import register_ablations
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_chdp.chdp import CHDP
 from sb3_chdp.chdp.candidates import Selection
 from sb3_chdp.chdp.critic import HybridCritic, QNetwork
 from sb3_chdp.chdp.policies import CHDPPolicy
+from sb3_chdp.common.encoding import RunningRanges
 from sb3_chdp.common.samples import HybridReplaySamples
 
 Aliases = dict[str, type[BasePolicy]]
@@ -32,6 +34,22 @@ class UnscaledPolicy(CHDPPolicy):
     """Values in the units of the rewards."""
 
     adapts_values: ClassVar[bool] = False
+
+
+class UnknownRanges(RunningRanges):
+    """They stay unknown: all positions are 0."""
+
+    def update(self, obs: PyTorchObs) -> None:
+        pass
+
+
+class UnplacedPolicy(CHDPPolicy):
+    """Critics do not see where entries of observations lie."""
+
+    def _make_critic(self, *args: Any) -> HybridCritic:
+        critic = super()._make_critic(*args)
+        critic.ranges = UnknownRanges(self.observation_space)
+        return critic
 
 
 class UnreadingPolicy(CHDPPolicy):
@@ -82,6 +100,12 @@ class WithoutValueScale(CHDP):
     """With :class:`UnscaledPolicy`."""
 
     policy_aliases: ClassVar[Aliases] = {"MlpPolicy": UnscaledPolicy}
+
+
+class WithoutPositions(CHDP):
+    """With :class:`UnplacedPolicy`."""
+
+    policy_aliases: ClassVar[Aliases] = {"MlpPolicy": UnplacedPolicy}
 
 
 class WithoutReads(CHDP):
@@ -137,7 +161,7 @@ class WithoutComparison(CHDP):
 
     def _discrete_policy_loss(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         latents, _ = self.actor.draw_latents(features, masks=replay_data.masks)
-        diffusion_loss = self.actor.discrete_policy.diffusion_loss(replay_data.latents, features)
+        diffusion_loss = self.actor.latent_loss(replay_data.latents, features)
         return diffusion_loss, -self.critic.score1(features, latents, replay_data.parameters).mean()
 
 
@@ -154,6 +178,7 @@ class WithoutParts(CHDP):
 LEFT_OUT: dict[str, type[CHDP]] = {
     "chdp_without_normalization": WithoutNormalization,
     "chdp_without_value_scale": WithoutValueScale,
+    "chdp_without_positions": WithoutPositions,
     "chdp_without_reads": WithoutReads,
     "chdp_without_latent_scale": WithoutLatentScale,
     "chdp_without_random_share": WithoutRandomShare,

@@ -40,6 +40,7 @@ def make(table, name, env=None, **kwargs):
 LACKS = {
     "without_normalization": lambda model: isinstance(model.critic.features_extractor, FlattenExtractor),
     "without_value_scale": lambda model: not model.policy.value_scale.adapts,
+    "without_positions": lambda model: not model.critic.features(th.rand(3, 2))[:, model.actor.features_dim :].any(),
     "without_reads": lambda model: model.actor.reads is None,
     "without_latent_scale": lambda model: (model.critic.q_networks[0].latent_scale == 1).all(),
     "without_random_share": lambda model: model.policy.random_share == 0,
@@ -79,7 +80,7 @@ def test_without_diffusion(table):
     model = make(table, "without_diffusion")
     features = model.critic.features(th.rand(1, 4)).detach().expand(4000, -1)
     with th.no_grad():
-        latents = model.actor.discrete_policy.sample(features)
+        latents, _ = model.actor.draw_latents(features)
         parameters = model.actor.sample_parameters(features, th.zeros(4000, dtype=th.long))
     for draws in (latents, parameters):
         assert draws.std(dim=0).numpy() == pytest.approx(0.1, rel=0.1)
@@ -89,7 +90,7 @@ def test_without_diffusion(table):
     full = make(table, "full")
     features = full.critic.features(th.rand(1, 4)).detach().expand(4000, -1)
     with th.no_grad():
-        assert full.actor.discrete_policy.sample(features).std(dim=0).min() > 0.2
+        assert full.actor.draw_latents(features)[0].std(dim=0).min() > 0.2
 
 
 @pytest.mark.parametrize("table", TABLES)

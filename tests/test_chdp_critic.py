@@ -11,9 +11,10 @@ from tests.fitting import unexplained
 N_FEATURES, LATENT_DIM = 6, 32
 
 
-def make_q_network(n_reads=4, n_features=N_FEATURES, latent_dim=LATENT_DIM, n_parameters=1):
+def make_q_network(n_reads=4, n_features=N_FEATURES, latent_dim=LATENT_DIM, n_parameters=1, n_positions=0):
     th.manual_seed(0)
-    return QNetwork(n_features, th.full((latent_dim,), latent_dim), n_parameters, [64, 64], th.nn.SiLU, n_reads)
+    widths = th.full((latent_dim,), latent_dim)
+    return QNetwork(n_features, n_positions, widths, n_parameters, [64, 64], th.nn.SiLU, n_reads)
 
 
 def test_values_are_bounded():
@@ -53,6 +54,30 @@ def test_reads_find_what_an_action_is_about():
     assert left[1] < 0.2 * left[0]
 
 
+def test_values_drop_where_an_entry_passes_a_threshold():
+    """One of four entries above 0.95: critics that see positions fit the drop in 300 steps, others do not."""
+    left = []
+    for n_positions in (0, 4):
+        q_network = make_q_network(n_features=4, n_positions=n_positions)
+
+        def batch(q_network=q_network, n_positions=n_positions):
+            x = th.rand(128, 4)
+            beyond = x.max(dim=1, keepdim=True)[0] > 0.95
+            features = th.cat([x, x[:, :n_positions]], dim=1)
+            return q_network(features, th.zeros(128, LATENT_DIM), th.zeros(128, 1)), -beyond.float()
+
+        left.append(unexplained(q_network, batch, 300))
+    assert left[1] < 0.3 < left[0]
+
+
+def test_several_actions_of_a_state():
+    """As if its features stood there for each of them."""
+    q_network, features = make_q_network(n_positions=2), th.rand(5, N_FEATURES + 2)
+    latents, parameters = th.rand(15, LATENT_DIM), th.rand(15, 1)
+    values = q_network(features, latents, parameters)
+    th.testing.assert_close(values, q_network(features.repeat_interleave(3, dim=0), latents, parameters))
+
+
 def test_value_of_the_state_and_advantages_add_up():
     """What does not depend on the action may come from a network that does not see it."""
     q_network, features = make_q_network(), th.randn(5, N_FEATURES)
@@ -82,7 +107,7 @@ def test_rescaled_values():
 )
 def test_wide_codewords_do_not_outweigh_features(codebook, widths, norms):
     """What A sees of a choice's codeword, alone and times a parameter, is no longer than 2; narrow ones stay as they are."""
-    network, seen = QNetwork(1, codebook.latent_widths(), 1, [8], th.nn.SiLU, 0), []
+    network, seen = QNetwork(1, 0, codebook.latent_widths(), 1, [8], th.nn.SiLU, 0), []
     network.advantage.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0][0]))
     network(th.zeros(1, 1), th.ones(1, sum(widths)), th.ones(1, 1))
     latents, products = seen[0][2:].chunk(2)

@@ -136,7 +136,7 @@ def test_discrete_actions_are_compared_with_parameters_of_their_own():
     assert th.equal(k.view(-1, 2 + losses.N_COMPARED)[:, 1], data.discrete_actions)
     # Drawn given these codewords, and as many as the action has
     ((condition,),) = conditions
-    assert th.equal(condition[:, features.shape[1] :][:, : latents.shape[1]], latents)
+    assert th.equal(condition[:, actor.features_dim :][:, : latents.shape[1]], latents)
     assert th.equal(parameters != 0, actor.padding_mask(k).bool())
 
 

@@ -29,6 +29,7 @@ class Critic(HybridCritic):
         self.q1, self.q2, self.asked = q1, q2 or q1, []
 
     def scores(self, features, latents, parameters):
+        features = features.repeat_interleave(len(latents) // len(features), dim=0)
         assert len(features) == len(latents) == len(parameters)
         q1, q2 = self.q1(features, latents, parameters), self.q2(features, latents, parameters)
         self.asked.append((features, latents, parameters, th.min(q1, q2)))
@@ -231,7 +232,7 @@ def test_predictions_are_the_best_candidates(deterministic):
         may_be_best = th.max(q1, q2) >= th.min(q1, q2).amax(dim=1, keepdim=True)
         is_acted = (parameters.numpy() == acted[:, None]).all(axis=2) & (k == acted_k[:, None])
         assert (is_acted & may_be_best.numpy()).any(axis=1).all()
-    assert len(calls[0][0]) >= 6 * (model.n_action_candidates + N_ACTIONS)
+    assert len(calls[0][1]) >= 6 * (model.n_action_candidates + N_ACTIONS)
 
 
 def test_more_candidates_for_deterministic_predictions_are_drawn_by_the_target_policies():

@@ -19,6 +19,7 @@ class CooperativeActor(nn.Module):
     radices).
 
     :param action_space: space of the action rows
+    :param features_dim: number of features of the state that the policies see; what stands behind them is for the critics
     :param codebook: quantises the latents
     :param discrete_policy: model of the latents given the features
     :param continuous_policy: model of the parameters given :meth:`condition`
@@ -30,12 +31,14 @@ class CooperativeActor(nn.Module):
     def __init__(
         self,
         action_space: HybridBox,
+        features_dim: int,
         codebook: Codebook | ProductCodebook,
         discrete_policy: DiffusionModel,
         continuous_policy: DiffusionModel,
         reads: AttentionReads | None = None,
     ):
         super().__init__()
+        self.features_dim = features_dim
         self.codebook = codebook
         self.discrete_policy = discrete_policy
         self.continuous_policy = continuous_policy
@@ -65,7 +68,7 @@ class CooperativeActor(nn.Module):
         :param masks: (B, K) False for discrete actions that may not be taken, None if all may
         :return: latents (B, latent_dim) as the discrete policy draws them, and the discrete actions (B,) that they decode to
         """
-        latents = self.discrete_policy.sample(features, noise=noise)
+        latents = self.discrete_policy.sample(features[:, : self.features_dim], noise=noise)
         return latents, self.codebook.quantize(latents, masks)
 
     def sample_latents(
@@ -80,12 +83,17 @@ class CooperativeActor(nn.Module):
         _, k = self.draw_latents(features, noise, masks)
         return self.codebook.representative_latents(k), k
 
+    def latent_loss(self, latents: th.Tensor, features: th.Tensor) -> th.Tensor:
+        """:return: diffusion loss of the discrete policy"""
+        return self.discrete_policy.diffusion_loss(latents, features[:, : self.features_dim])
+
     def condition(self, features: th.Tensor, codewords: th.Tensor) -> th.Tensor:
         """
         :param features: (B, features_dim)
         :param codewords: (B, latent_dim)
         :return: (B, condition_dim) what the continuous policy is conditioned on
         """
+        features = features[:, : self.features_dim]
         reads = [] if self.reads is None else [self.reads(features, codewords)]
         return th.cat([features, codewords, *reads], dim=1)
 

@@ -71,10 +71,8 @@ class Candidates(NamedTuple):
         :param sampled: whether to draw values
         :return: (B, n) the smaller of both :meth:`HybridCritic.scores`, or a uniform draw between the two
         """
-        n = self.latents.shape[1]
-        inputs = features.repeat_interleave(n, dim=0), self.latents.flatten(0, 1), self.parameters.flatten(0, 1)
-        q1, q2 = critic.scores(*inputs)
-        return (th.lerp(q1, q2, th.rand_like(q1)) if sampled else th.min(q1, q2)).view(-1, n)
+        q1, q2 = critic.scores(features, self.latents.flatten(0, 1), self.parameters.flatten(0, 1))
+        return (th.lerp(q1, q2, th.rand_like(q1)) if sampled else th.min(q1, q2)).view(-1, self.latents.shape[1])
 
     def best(
         self, critic: HybridCritic, features: th.Tensor, allowed: th.Tensor | None = None, sampled: bool = False

@@ -45,7 +45,8 @@ class CHDP(ExploringAlgorithm):
 
     :class:`PaperCHDP` is the algorithm as published. Differences from it:
         1. observations are normalised, see :class:`NormalizedExtractor`, and values, see :class:`ValueScale`;
-        2. critics have layer normalisation, a state value of their own and read parts of the state, see :class:`QNetwork`;
+        2. critics have layer normalisation, a state value of their own, which sees thresholds, and read parts of the
+           state, see :class:`QNetwork`;
         3. the critics' loss trains the codebook too, so that actions of similar effect get similar codewords; these are what
            critics see of a discrete action, not the latents around them that decode to it, see :class:`CooperativeActor`;
         4. the values of next states depend on what the episode has returned so far, see :class:`ReturnNetwork`;

@@ -9,6 +9,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
+from sb3_chdp.common.encoding import RunningRanges, n_bins_of, ramps
 from sb3_chdp.common.normalization import RunningNormalization
 
 # Factor of the logits, which start small
@@ -66,12 +67,14 @@ class QNetwork(nn.Module):
     which would lose how large their inputs are.
 
     A sees what the latent reads of the features, see :class:`AttentionReads`, and the products of all its entries with all
-    parameters: what a parameter does depends on the discrete action, often by a factor. V and A are not told apart
-    further: V learns what does not depend on the action (as in Wang et al., 2016).
+    parameters: what a parameter does depends on the discrete action, often by a factor. V sees where entries of the
+    observation lie, see :func:`ramps`. V and A are not told apart further: V learns what does not depend on the action (as in
+    Wang et al., 2016).
 
     Wide codewords are scaled down for A: with their products they would outweigh the features.
 
     :param features_dim: number of features of the state
+    :param n_positions: number of entries of the observation whose positions stand behind the features
     :param latent_widths: (latent_dim,) how wide the codeword is that an entry of the latent belongs to
     :param n_parameters: number of parameters
     :param net_arch: hidden layers of A; V has one of half the width of the first
@@ -84,6 +87,7 @@ class QNetwork(nn.Module):
     def __init__(
         self,
         features_dim: int,
+        n_positions: int,
         latent_widths: th.Tensor,
         n_parameters: int,
         net_arch: list[int],
@@ -91,20 +95,24 @@ class QNetwork(nn.Module):
         n_reads: int,
     ):
         super().__init__()
-        latent_dim = len(latent_widths)
+        self.features_dim, self.n_bins, latent_dim = features_dim, n_bins_of(n_positions), len(latent_widths)
         self.register_buffer("latent_scale", (LATENT_NORM / latent_widths.sqrt()).clamp(max=1), persistent=False)
         self.reads = AttentionReads(features_dim, latent_dim, n_reads)
         value_arch = [width // 2 for width in net_arch[:1]]
-        self.value = value_mlp(features_dim, value_arch, activation_fn)
+        self.value = value_mlp(features_dim + self.n_bins * n_positions, value_arch, activation_fn)
         n_inputs = features_dim + n_parameters + latent_dim + n_reads + latent_dim * n_parameters
         self.advantage = value_mlp(n_inputs, net_arch, activation_fn)
 
     def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-        """:return: (B, 1) values"""
+        """:return: (B * n, 1) values"""
+        features, positions = features.split([self.features_dim, features.shape[1] - self.features_dim], dim=1)
+        values = self.value(th.cat([features, ramps(positions, self.n_bins)], dim=1))
+        n = latents.shape[0] // features.shape[0]
+        if n > 1:
+            features, values = features.repeat_interleave(n, dim=0), values.repeat_interleave(n, dim=0)
         reads, latents = self.reads(features, latents), self.latent_scale * latents
         products = (latents[:, :, None] * parameters[:, None]).flatten(1)
-        x = th.cat([features, parameters, latents, reads, products], dim=1)
-        return self.value(features) + self.advantage(x)
+        return values + self.advantage(th.cat([features, parameters, latents, reads, products], dim=1))
 
     @th.no_grad()
     def rescale(self, factor: th.Tensor, summand: th.Tensor) -> None:
@@ -136,13 +144,13 @@ class ReturnNetwork(nn.Module):
 
     def forward(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor, returns: th.Tensor) -> th.Tensor:
         """
-        :param features: (B, features_dim)
+        :param features: (B, features_dim + n_positions)
         :param latents: (B, latent_dim)
         :param parameters: (B, n_parameters) scaled parameters
         :param returns: (B, 1) sum of the episode's rewards before the action
         :return: (B, 1) summands, in the units of the critics
         """
-        return self.network(th.cat([features, self.normalization(returns)], dim=1), latents, parameters)
+        return self.network(th.cat([self.normalization(returns), features], dim=1), latents, parameters)
 
 
 class HybridCritic(BaseModel):
@@ -155,6 +163,7 @@ class HybridCritic(BaseModel):
     :param q_networks: two networks of features, latents and parameters
     :param reward_network: such a network of the reward alone, for foresight below 1; None: foresight is always 1
     :param return_network: what returns add to the values; None: nothing
+    :param ranges: where entries of observations lie; None: networks do not see it
     :param normalize_images: whether to divide images by 255
 
     :ivar foresight: weight in [0, 1] of what follows a reward in the choice of actions
@@ -164,6 +173,7 @@ class HybridCritic(BaseModel):
     optimizer: th.optim.Optimizer
     reward_network: nn.Module | None
     return_network: ReturnNetwork | None
+    ranges: RunningRanges | None
 
     def __init__(
         self,
@@ -173,6 +183,7 @@ class HybridCritic(BaseModel):
         q_networks: list[nn.Module],
         reward_network: nn.Module | None = None,
         return_network: ReturnNetwork | None = None,
+        ranges: RunningRanges | None = None,
         normalize_images: bool = True,
     ):
         super().__init__(
@@ -181,30 +192,39 @@ class HybridCritic(BaseModel):
         self.q_networks = nn.ModuleList(q_networks)
         self.reward_network = reward_network
         self.return_network = return_network
+        self.ranges = ranges
         self.foresight = 1.0
 
     def features(self, obs: PyTorchObs) -> th.Tensor:
-        """:return: (B, features_dim) features of the observations"""
-        return self.extract_features(obs, self.features_extractor)
+        """
+        :param obs: (B, ...) observations, which ranges count in training mode
+        :return: (B, features_dim + n_positions) their features, and where their entries lie
+        """
+        features = self.extract_features(obs, self.features_extractor)
+        if self.ranges is None:
+            return features
+        if self.training:
+            self.ranges.update(obs)
+        return th.cat([features, self.ranges(obs)], dim=1)
 
     def q_values(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
-        :param features: (B, features_dim) from :meth:`features`
-        :param latents: (B, latent_dim)
-        :param parameters: (B, n_parameters) scaled parameters
-        :return: Q1 and Q2, each (B, 1), in the units of :class:`ValueScale`
+        :param features: (B, ...) from :meth:`features`
+        :param latents: (B * n, latent_dim), of n actions for each of the observations
+        :param parameters: (B * n, n_parameters) scaled parameters
+        :return: Q1 and Q2, each (B * n, 1), in the units of :class:`ValueScale`
         """
         q1, q2 = (q_net(features, latents, parameters) for q_net in self.q_networks)
         return q1, q2
 
     def scores(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> tuple[th.Tensor, ...]:
         """
-        :return: what decides between actions, each (B, 1): :meth:`q_values`, with what follows the reward weighted
+        :return: what decides between actions, each (B * n, 1): :meth:`q_values`, with what follows the reward weighted
         """
         return self.weigh(self.q_values(features, latents, parameters), features, latents, parameters)
 
     def score1(self, features: th.Tensor, latents: th.Tensor, parameters: th.Tensor) -> th.Tensor:
-        """:return: (B, 1) the first of :meth:`scores` alone"""
+        """:return: (B * n, 1) the first of :meth:`scores` alone"""
         return self.weigh((self.q_networks[0](features, latents, parameters),), features, latents, parameters)[0]
 
     def weigh(

@@ -181,9 +181,8 @@ def discrete_policy_loss(
         k = th.cat([nearest[:, None], replay_data.discrete_actions[:, None], others], dim=1)
         n = k.shape[1]
         codewords = codebook.representative_latents(k)
-        repeated = features.repeat_interleave(n, dim=0)
-        parameters = actor.sample_parameters(repeated, k.flatten(0, 1))
-        values = policy.critic.score1(repeated, codewords.flatten(0, 1), parameters).view(-1, n)
+        parameters = actor.sample_parameters(features.repeat_interleave(n, dim=0), k.flatten(0, 1))
+        values = policy.critic.score1(features, codewords.flatten(0, 1), parameters).view(-1, n)
         gains = (values - values[:, :1]).clamp(min=-LARGEST_DEFICIT)
         # An action that is there twice competes once
         competes = first_occurrences(k)
@@ -193,7 +192,7 @@ def discrete_policy_loss(
         most = gains.masked_fill(~competes, -th.inf).amax(dim=1, keepdim=True)
         competes &= (most == 0) | (gains == most) | (gains == 0)
     weights = soft_quantization(latents, codewords, competes)
-    diffusion_loss = actor.discrete_policy.diffusion_loss(replay_data.latents, features)
+    diffusion_loss = actor.latent_loss(replay_data.latents, features)
     return diffusion_loss, -(weights * gains).sum(dim=1).mean()
 
 

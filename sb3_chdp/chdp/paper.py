@@ -246,7 +246,7 @@ class PaperCHDP(CHDP):
     def _discrete_policy_loss(self, replay_data: HybridReplaySamples, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Eq. 7 as it stands: the value of the latents that were drawn, with the stored parameters."""
         latents, _ = self.actor.sample_latents(features, masks=replay_data.masks)
-        diffusion_loss = self.actor.discrete_policy.diffusion_loss(replay_data.latents, features)
+        diffusion_loss = self.actor.latent_loss(replay_data.latents, features)
         return diffusion_loss, -self.critic.score1(features, latents, replay_data.parameters).mean()
 
     def _exploration_rate(self) -> float:

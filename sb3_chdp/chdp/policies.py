@@ -19,6 +19,7 @@ from sb3_chdp.chdp.diffusion import DiffusionModel
 from sb3_chdp.chdp.product_codebook import ProductCodebook
 from sb3_chdp.chdp.repeatable_noise import repeatable_noise
 from sb3_chdp.chdp.value_scale import ValueScale
+from sb3_chdp.common.encoding import RunningRanges
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.normalization import NormalizedCombinedExtractor, NormalizedExtractor
 from sb3_chdp.common.policies import CnnFeatures, HybridPolicy
@@ -136,15 +137,18 @@ class CHDPPolicy(HybridPolicy):
     def _make_critic(self, extractor: BaseFeaturesExtractor, codebook: Codebook | ProductCodebook) -> HybridCritic:
         n_parameters = self.action_space.spec.max_parameters
         critic_arch = get_actor_critic_arch(self.net_arch)[1]
-        sizes = extractor.features_dim, codebook.latent_widths(), n_parameters, critic_arch, self.activation_fn, self.n_reads
-        q1, q2, rewards = (QNetwork(*sizes) for _ in range(3))
+        ranges = RunningRanges(self.observation_space)
+        sizes = extractor.features_dim, ranges.n, codebook.latent_widths(), n_parameters
+        arguments = *sizes, critic_arch, self.activation_fn, self.n_reads
+        q1, q2, rewards = (QNetwork(*arguments) for _ in range(3))
         return HybridCritic(
             self.observation_space,
             self.action_space,
             extractor,
             [q1, q2],
             rewards,
-            ReturnNetwork(*sizes) if "returns" in self.action_space.columns else None,
+            ReturnNetwork(*arguments) if "returns" in self.action_space.columns else None,
+            ranges if ranges.n else None,
             self.normalize_images,
         )
 
@@ -152,6 +156,7 @@ class CHDPPolicy(HybridPolicy):
         latent_dim, n_parameters = codebook.latent_dim, self.action_space.spec.max_parameters
         return self.actor_class(
             self.action_space,
+            features_dim,
             codebook,
             self._make_model(latent_dim, features_dim),
             self._make_model(n_parameters, features_dim + latent_dim + self.n_reads),
