@@ -1,8 +1,10 @@
-"""Files of other classes and versions say so, and SB3 reads what this package writes."""
+"""Files of other classes and versions say so, published ones load, and SB3 reads what this package writes."""
 
 import json
 import zipfile
+from pathlib import Path
 
+import gymnasium as gym
 import pytest
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -10,7 +12,7 @@ from stable_baselines3.common.policies import BaseModel
 from stable_baselines3.common.save_util import load_from_zip_file
 
 import sb3_chdp
-from sb3_chdp import CHDP, HHQNTD3, PATD3
+from sb3_chdp import ALGORITHMS, CHDP, HHQNTD3, PATD3
 from sb3_chdp.chdp import PaperCHDP
 from tests.algorithms import make_model
 from tests.hybrid_envs import make_layout_env
@@ -63,6 +65,13 @@ def test_version_that_does_not_fit(tmp_path):
     with pytest.raises(ValueError, match=r"was saved by sb3_chdp 99\.1\.0 and does not fit sb3_chdp ") as error:
         PATD3.load(changed)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("path", sorted((Path(__file__).parent.parent / "benchmarks" / "models").glob("*/*/*.zip")))
+def test_published_models_load(path):
+    algorithm = ALGORITHMS[path.parent.parent.name].load_class()
+    env = gym.make(path.stem)
+    assert env.action_space.contains(algorithm.load(path).predict(env.reset(seed=0)[0])[0])
 
 
 def test_zip_of_sb3s_kind(algorithm, tmp_path):
