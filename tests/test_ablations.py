@@ -37,10 +37,11 @@ def make(table, name, env=None, **kwargs):
     return filled_model(env, algorithm_class=algorithm, **kwargs)
 
 
+OBS = th.rand(9, 2)
 LACKS = {
     "without_normalization": lambda model: isinstance(model.critic.features_extractor, FlattenExtractor),
     "without_value_scale": lambda model: not model.policy.value_scale.adapts,
-    "without_positions": lambda model: not model.critic.features(th.rand(3, 2))[:, model.actor.features_dim :].any(),
+    "without_positions": lambda model: model.critic.ranges.update(OBS) is None and not model.critic.ranges(OBS).any(),
     "without_reads": lambda model: model.actor.reads is None,
     "without_latent_scale": lambda model: (model.critic.q_networks[0].latent_scale == 1).all(),
     "without_random_share": lambda model: model.policy.random_share == 0,

@@ -8,7 +8,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-# Bins of an entry, fewer where all entries together would have more than so many, none where each would have less than so many
+# Bins of an entry; fewer if all entries together would have more than MAX_BINS, none if each would have fewer than MIN_BINS
 N_BINS, MAX_BINS, MIN_BINS = 16, 512, 4
 # By how much a range shrinks per batch towards that of the batch: what was seen once is forgotten
 SHRINKAGE = 0.001
