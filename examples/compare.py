@@ -33,18 +33,18 @@ def mean_return(env: gym.Env, act: Callable[[Any], Any], n_episodes: int) -> flo
     return total / n_episodes
 
 
-def write_row(page: Path, name: str, cells: str) -> None:
+def write_row(page: Path, start: str, cells: str) -> None:
     """
     Put what was measured into the row of a Markdown table.
 
     :param page: the Markdown file
-    :param name: first cell of the row
-    :param cells: the cells behind it
-    :raises ValueError: if no row begins with the name
+    :param start: first cells of the row
+    :param cells: the cells behind them
+    :raises ValueError: if no row begins with them
     """
-    text, n_rows = re.subn(rf"^\| {re.escape(name)} \|.*$", f"| {name} | {cells} |", page.read_text(), flags=re.MULTILINE)
+    text, n_rows = re.subn(rf"^\| {re.escape(start)} \|.*$", f"| {start} | {cells} |", page.read_text(), flags=re.MULTILINE)
     if n_rows == 0:
-        raise ValueError(f"no row of a table in {page} begins with {name!r}")
+        raise ValueError(f"no row of a table in {page} begins with {start!r}")
     page.write_text(text)
 
 
@@ -55,7 +55,7 @@ def compare(env: gym.Env, rule: Callable[[gym.Env], Any], n_timesteps: int, name
     :param env: environment with hybrid actions and observations that are a vector
     :param rule: gives the action of a simple rule
     :param n_timesteps: steps of the training
-    :param name: of the row in docs/examples.md
+    :param name: of its rows in docs/examples.md
     """
     parser = argparse.ArgumentParser()
     parser.add_argument("--algo", default="chdp", choices=list(ALGORITHMS))
@@ -84,5 +84,5 @@ def compare(env: gym.Env, rule: Callable[[gym.Env], Any], n_timesteps: int, name
     for what, value in returns.items():
         print(f"{what:16} {value:,.1f}")
     if args.write:
-        settings = f"{ALGORITHMS[args.algo].display_name} | {args.steps:,} | {len(args.seeds)}"
-        write_row(PAGE, name, f"{settings} | {' | '.join(f'{value:,.1f}' for value in returns.values())}")
+        start, settings = f"{name} | {ALGORITHMS[args.algo].display_name}", f"{args.steps:,} | {len(args.seeds)}"
+        write_row(PAGE, start, f"{settings} | {' | '.join(f'{value:,.1f}' for value in returns.values())}")

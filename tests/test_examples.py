@@ -49,8 +49,8 @@ def test_a_few_steps(name, tmp_path):
 def test_the_table_is_filled_row_by_row(tmp_path):
     write_row = runpy.run_path(str(FOLDER / "compare.py"))["write_row"]
     page = tmp_path / "page.md"
-    page.write_text("| a | 1 | 2 |\n| b | 3 | 4 |\n")
-    write_row(page, "a", "5 | 6")
-    assert page.read_text() == "| a | 5 | 6 |\n| b | 3 | 4 |\n"
+    page.write_text("| a | X | 1 |\n| a | Y | 2 |\n| b | X | 3 |\n")
+    write_row(page, "a | Y", "4")
+    assert page.read_text() == "| a | X | 1 |\n| a | Y | 4 |\n| b | X | 3 |\n"
     with pytest.raises(ValueError, match="begins with 'c'"):
         write_row(page, "c", "7 | 8")
