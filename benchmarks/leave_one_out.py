@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch as th
 from ablations import register_ablations
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
@@ -144,6 +145,12 @@ class WithoutReturns(CHDP):
     knows_returns: ClassVar[bool] = False
 
 
+class WithoutLongReturns(CHDP):
+    """Returns of one step."""
+
+    default_buffer_class: ClassVar[type[ReplayBuffer] | None] = None
+
+
 class WithoutUniform(CHDP):
     """The continuous policy is improved for the actions of the discrete policy alone."""
 
@@ -185,6 +192,7 @@ LEFT_OUT: dict[str, type[CHDP]] = {
     "chdp_without_candidates": WithoutCandidates,
     "chdp_without_foresight": WithoutForesight,
     "chdp_without_returns": WithoutReturns,
+    "chdp_without_long_returns": WithoutLongReturns,
     "chdp_without_uniform": WithoutUniform,
     "chdp_without_learnt_codewords": WithoutLearntCodewords,
     "chdp_without_comparison": WithoutComparison,

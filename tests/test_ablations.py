@@ -13,6 +13,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from sb3_chdp import ALGORITHMS, CHDP
 from sb3_chdp.chdp import PaperCHDP
 from sb3_chdp.chdp.candidates import Selection
+from sb3_chdp.common.watkins_buffer import WatkinsReplayBuffer
 from tests.algorithms import calls_of, filled_model, has_learnt, sample, snapshot
 from tests.hybrid_envs import HybridIdentityEnv, LayoutEnv, box, make_layout_env
 
@@ -48,6 +49,7 @@ LACKS = {
     "without_candidates": lambda model: model.policy.select == model.policy.select_target == Selection(1),
     "without_foresight": lambda model: model.policy.set_foresight(0.5) is None and model.critic.foresight == 1,
     "without_returns": lambda model: model.critic.return_network is None,
+    "without_long_returns": lambda model: not isinstance(model.replay_buffer, WatkinsReplayBuffer),
     "without_uniform": lambda model: model.uniform_fraction == 0,
     "without_learnt_codewords": lambda model: not model.critics_train_codebook,
     "without_comparison": lambda model: type(model)._discrete_policy_loss is not CHDP._discrete_policy_loss,

@@ -41,7 +41,7 @@ def networks_with_gradient(model, loss):
 def all_losses(model):
     data, policy = sample(model), model.policy
     features = policy.critic.features(data.observations)
-    targets = policy.in_units_of_critics(losses.target_values(policy, data))
+    targets = policy.in_units_of_critics(losses.target_values(policy, data)[0])
     critic, *_ = losses.critic_loss(policy, data, features, targets[:, :1])
     features = features.detach()
     discrete = model._discrete_policy_loss(data, features)
@@ -270,7 +270,7 @@ def test_target_values(algorithm_class):
 
     for discounts in (0.9, th.full((32, 1), 0.1)):
         th.manual_seed(0)
-        targets = losses.target_values(policy, data._replace(discounts=discounts))
+        targets, _ = losses.target_values(policy, data._replace(discounts=discounts))
         th.testing.assert_close(targets, expected(discounts))
         assert targets.shape == (32, 2) and not targets.requires_grad
         assert ((targets[:, 0] == targets[:, 1]) == (data.dones[:, 0] == 1)).all()
@@ -284,7 +284,7 @@ def test_next_values_are_whole_without_foresight():
     policy.set_foresight(0.0)
     features = model.critic_target.features(data.next_observations)
     th.manual_seed(0)
-    targets = losses.target_values(policy, data._replace(discounts=0.9, dones=0.0))
+    targets, _ = losses.target_values(policy, data._replace(discounts=0.9, dones=0.0))
     th.manual_seed(0)
     q_values = next_q_values(policy, features)
     policy.set_foresight(1.0)

@@ -119,12 +119,12 @@ def test_next_values_know_returns_and_actions_do_not():
     data = sample(model)
     targets, losses_of = (calls_of(critic.return_network) for critic in (model.critic_target, model.critic))
     losses.target_values(model.policy, data)
-    # Of the best action and of a random one
-    assert len(targets) == 2 and all(th.equal(inputs[3], data.next_returns) for inputs in targets)
+    # Of the best action, of the one that was taken and of a random one
+    assert len(targets) == 3 and all(th.equal(inputs[3], data.next_returns) for inputs in targets)
     model.train(1, 32)
-    assert len(targets) == 4 and len(losses_of) == 1
+    assert len(targets) == 6 and len(losses_of) == 1
     model.predict(data.observations.numpy())
-    assert len(targets) == 4 and len(losses_of) == 1
+    assert len(targets) == 6 and len(losses_of) == 1
 
 
 def test_what_returns_add():
@@ -133,13 +133,13 @@ def test_what_returns_add():
     data, policy = sample(model)._replace(dones=0.0, discounts=1.0), model.policy
     policy.in_units_of_critics(th.randn(32, 2))
     th.manual_seed(0)
-    before = losses.target_values(policy, data)
+    before, _ = losses.target_values(policy, data)
     # Nothing yet
     th.manual_seed(0)
-    th.testing.assert_close(before, losses.target_values(policy, data._replace(next_returns=None)))
+    th.testing.assert_close(before, losses.target_values(policy, data._replace(next_returns=None))[0])
     model.critic_target.return_network.forward = lambda features, latents, parameters, returns: returns
     th.manual_seed(0)
-    added = losses.target_values(policy, data)[:, 0] - before[:, 0]
+    added = losses.target_values(policy, data)[0][:, 0] - before[:, 0]
     th.testing.assert_close(added, policy.value_scale.scale * data.next_returns[:, 0].double())
 
 

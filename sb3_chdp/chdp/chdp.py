@@ -25,9 +25,12 @@ from sb3_chdp.common.arguments import NOT_NEGATIVE, Accepted, of_networks, warn_
 from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.samples import HybridReplaySamples
 from sb3_chdp.common.utils import gradient_step
+from sb3_chdp.common.watkins_buffer import WatkinsReplayBuffer
 
 # High at first, and 0 in the end: what is learnt settles
 LEARNING_RATE = LinearSchedule(1e-3, 0.0, 1.0)
+# What actions on the way may cost in an n-step return, in the critics' units, where what follows counts in full
+LARGEST_COST = 0.1
 
 
 class CHDP(ExploringAlgorithm):
@@ -52,13 +55,14 @@ class CHDP(ExploringAlgorithm):
         4. the values of next states depend on what the episode has returned so far, see :class:`ReturnNetwork`;
         5. of several actions the one that critics value most acts; while training, those that they disagree about are tried,
            see :class:`Selection`; in targets it is the next action, with a small share of a random one, :func:`next_values`;
-        6. the discrete policy is improved by comparing a few discrete actions, each with the parameters that the continuous
+        6. returns in targets go on over actions that cost little, see :class:`WatkinsReplayBuffer`;
+        7. the discrete policy is improved by comparing a few discrete actions, each with the parameters that the continuous
            policy draws for it, see :func:`discrete_policy_loss`, and the continuous policy for uniformly random ones too;
-        7. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate`,
+        8. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate`,
            :func:`informative_steps` and :func:`vary_parts`;
-        8. a network learns rewards, and what follows a reward counts less in the choice of actions where
+        9. a network learns rewards, and what follows a reward counts less in the choice of actions where
            exploratory actions have shown no influence on it, see :class:`ForesightSums`;
-        9. the learning rate falls linearly to 0.
+        10. the learning rate falls linearly to 0.
 
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...)
     :param env: The environment to learn from (if registered in Gym, can be str), with a hybrid action space
@@ -76,7 +80,8 @@ class CHDP(ExploringAlgorithm):
         With :class:`PrioritizedReplayBuffer` transitions of large TD error are replayed more often
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer at a cost of more complexity.
-    :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the critics.
+    :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the critics. By default n
+        depends on what actions cost, see :class:`WatkinsReplayBuffer`; with ``replay_buffer_class=ReplayBuffer`` it is 1
     :param latent_dim: width d_e of the latent and of a codeword, at most that of one choice of a factored space
     :param n_diffusion_steps: number N of denoising steps of both policies
     :param eta: weight of the policy improvement terms relative to the diffusion losses
@@ -114,6 +119,7 @@ class CHDP(ExploringAlgorithm):
     # Bound on the gradient norm of an optimizer. Most batches of the critics reach it, and count alike: with a wider one they
     # forget now and then what they had learnt
     max_grad_norm: ClassVar[float] = 1.0
+    default_buffer_class: ClassVar[type[ReplayBuffer] | None] = WatkinsReplayBuffer
 
     policy: CHDPPolicy
     actor: CooperativeActor
@@ -208,6 +214,8 @@ class CHDP(ExploringAlgorithm):
         critic_optimizers = [policy.critic.optimizer]
         if self.critics_train_codebook:
             critic_optimizers.append(policy.codebook_optimizer)
+        if isinstance(self.replay_buffer, WatkinsReplayBuffer):
+            self.replay_buffer.tolerance = LARGEST_COST * self.foresight_sums.weight()
         if self._n_updates == 0 and policy.value_scale.adapts:
             self._start_values()
 
@@ -217,7 +225,11 @@ class CHDP(ExploringAlgorithm):
             replay_data = self._sample_batch(batch_size)
 
             # Step 0: critics, eq. 10 and 11, and the codebook if they train it
-            targets = policy.in_units_of_critics(target_values(policy, replay_data))
+            targets, costs = target_values(policy, replay_data)
+            targets = policy.in_units_of_critics(targets)
+            if isinstance(self.replay_buffer, WatkinsReplayBuffer):
+                assert replay_data.next_indices is not None and costs is not None, "such a buffer says what follows"
+                self.replay_buffer.update_costs(replay_data.next_indices, costs)
             features = policy.critic.features(replay_data.observations)
             self.update_targets.copy_statistics()
             loss, q1, errors = critic_loss(policy, replay_data, features, targets[:, :1])

@@ -128,7 +128,7 @@ class ExploringAlgorithm(HybridOffPolicyAlgorithm):
         columns = self.hybrid_space.columns
         next_masks = self.policy.mask_tensor(columns.masks(rows, "next_masks") if self.use_masking else None)
         returns = th.tensor(self.returns_so_far, dtype=th.float32, device=self.device)[:, None]
-        values = next_values(self.policy, self.policy.obs_to_tensor(new_obs)[0], next_masks, returns)
+        values, _ = next_values(self.policy, self.policy.obs_to_tensor(new_obs)[0], next_masks, returns)
         came = th.as_tensor(rewards + self.gamma * (1 - dones) * values.flatten().cpu().numpy(), device=self.device)
         outputs = self.policy.value_scale.outputs(th.stack([came, came], dim=1))[:, 0]
         outcomes = outputs.clamp(-LARGEST_OUTCOME, LARGEST_OUTCOME).tolist()

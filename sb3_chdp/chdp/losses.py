@@ -14,8 +14,12 @@ N_COMPARED = 2
 
 @th.no_grad()
 def next_values(
-    policy: CHDPPolicy, observations: PyTorchObs, masks: th.Tensor | None = None, returns: th.Tensor | None = None
-) -> th.Tensor:
+    policy: CHDPPolicy,
+    observations: PyTorchObs,
+    masks: th.Tensor | None = None,
+    returns: th.Tensor | None = None,
+    stored: th.Tensor | None = None,
+) -> tuple[th.Tensor, th.Tensor | None]:
     """
     min_j Q'_j(s', e', a') of the best action (e', a') among a few of the target policies, and with the weight
     ``policy.random_share`` of a uniformly random action.
@@ -27,7 +31,9 @@ def next_values(
     :param observations: (B, ...) next observations
     :param masks: (B, K) False for discrete actions that may not be taken, None if all may
     :param returns: (B, 1) what episodes have returned, which the policies do not know; None: not known at all
-    :return: (B, 1) values in the units of the rewards, with all that follows
+    :param stored: (B, columns) rows of other actions
+    :return: (B, 1) values in the units of the rewards, with all that follows, and in those of the critics (B, 1) by how much
+        the stored actions are worth less than the best ones, None without any
     """
     critic, actor = policy.critic_target, policy.actor_target
     features = critic.features(observations)
@@ -39,26 +45,34 @@ def next_values(
         return values + critic.return_network(features, latents, parameters, returns)
 
     latents, _, parameters = policy.select_target(actor, policy.choosing_critic, features, masks=masks)
-    values = values_of(latents, parameters)
+    values, costs = values_of(latents, parameters), None
+    if stored is not None:
+        columns = policy.action_space.columns
+        latents = actor.codebook.representative_latents(columns.discrete_actions(stored))
+        costs = values - values_of(latents, columns.view(stored, "parameters"))
     if policy.random_share > 0:
         latents, _, parameters = actor.random_actions(len(features), masks=masks)
         values = values.lerp(values_of(latents, parameters), policy.random_share)
-    return policy.value_scale.values(values)
+    return policy.value_scale.values(values), costs
 
 
 @th.no_grad()
-def target_values(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> th.Tensor:
+def target_values(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> tuple[th.Tensor, th.Tensor | None]:
     """
-    Eq. 11, y = r + gamma min_j Q'_j(s', e', a'), see :func:`next_values`, and r alone,
-    with n-step returns the n rewards.
+    Eq. 11, y = r + gamma min_j Q'_j(s', e', a'), see :func:`next_values`, and r alone. With n-step returns r is n rewards, if
+    not told which the first is.
 
     :param policy: the networks
     :param replay_data: a batch
-    :return: (B, 2) values and rewards, in the units of the rewards
+    :return: (B, 2) values and rewards, in the units of the rewards, and (B, 1) what the actions cost that were taken in the
+        next states, None if not known
     """
-    values = next_values(policy, replay_data.next_observations, replay_data.next_masks, replay_data.next_returns)
+    values, costs = next_values(
+        policy, replay_data.next_observations, replay_data.next_masks, replay_data.next_returns, replay_data.next_actions
+    )
     follows = (1 - replay_data.dones) * replay_data.discounts * values
-    return th.cat([replay_data.rewards + follows, replay_data.rewards], dim=1)
+    rewards = replay_data.rewards if replay_data.first_rewards is None else replay_data.first_rewards
+    return th.cat([replay_data.rewards + follows, rewards], dim=1), costs
 
 
 def critic_loss(

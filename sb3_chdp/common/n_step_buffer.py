@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
@@ -34,11 +35,15 @@ class HybridNStepReplayBuffer(NStepReplayBuffer):
         ends |= steps == (self.pos - 1) % self.buffer_size
         ends[:, -1] = True
         last = steps[np.arange(len(steps)), ends.argmax(axis=1)]
-        columns, last_rows = self.action_space.columns, self.to_torch(self.actions[last, env_indices])
+        self._tell_last(samples.actions, self.to_torch(self.actions[last, env_indices]))
+        return samples
+
+    def _tell_last(self, rows: th.Tensor, last_rows: th.Tensor) -> None:
+        """What rows say about the next state becomes that of the last of the n steps."""
+        columns = self.action_space.columns
         for name in self.action_space.state_parts:
             if name.startswith("next_"):
-                columns.view(samples.actions, name)[:] = columns.view(last_rows, name)
-        return samples
+                columns.view(rows, name)[:] = columns.view(last_rows, name)
 
 
 # What rows say about the next state is that of the last of n steps
@@ -49,7 +54,12 @@ TELLS_LAST = Accepted(
 
 
 def n_step_settings(
-    kind: type[ReplayBuffer] | None, kwargs: dict[str, Any], n_steps: int, gamma: float, has_dicts: bool
+    kind: type[ReplayBuffer] | None,
+    kwargs: dict[str, Any],
+    n_steps: int,
+    gamma: float,
+    has_dicts: bool,
+    default: type[ReplayBuffer] | None,
 ) -> tuple[type[ReplayBuffer] | None, dict[str, Any]]:
     """
     :param kind: class of the replay buffer, None if the user names none
@@ -57,8 +67,11 @@ def n_step_settings(
     :param n_steps: that of the algorithm; with 1 the default of a buffer of n steps holds
     :param gamma: that of the algorithm
     :param has_dicts: whether observations are dicts, of which SB3 refuses n-step returns
+    :param default: class of the buffer if neither the user names one nor ``n_steps`` asks for one; None: SB3's
     :return: class and keyword arguments of the buffer to make
     """
+    if kind is None and n_steps == 1:
+        kind = default
     if kind is NStepReplayBuffer or (kind is None and n_steps > 1 and not has_dicts):
         kind = HybridNStepReplayBuffer
     if kind is not None and issubclass(kind, NStepReplayBuffer):

@@ -8,6 +8,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, ReplayBufferSample
 from sb3_chdp.common.buffers import Index, PrioritizedReplayBufferSamples
 from sb3_chdp.common.hybrid_box import HybridBox
 from sb3_chdp.common.rows import MASK_PARTS
+from sb3_chdp.common.watkins_buffer import WatkinsReplayBufferSamples
 
 
 class HybridReplaySamples(NamedTuple):
@@ -19,7 +20,8 @@ class HybridReplaySamples(NamedTuple):
     rewards, dones, and with n-step returns discounts (B, 1); weights (B, 1) of a prioritised buffer and indices, where it
     stores them; masks and next_masks (B, K) boolean, which discrete actions the environment allowed in the state and in the
     next one, None without masking; returns and next_returns (B, 1), the sum of the episode's rewards before the action and
-    with its reward, None if rows hold none. In a factored space discrete_actions are (B, L) and masks (B, sum of the radices).
+    with its reward, None if rows hold none; first_rewards, next_actions and next_indices are those of a
+    :class:`WatkinsReplayBuffer`. In a factored space discrete_actions are (B, L) and masks (B, sum of the radices).
     """
 
     observations: PyTorchObs
@@ -37,10 +39,15 @@ class HybridReplaySamples(NamedTuple):
     next_masks: th.Tensor | None = None
     returns: th.Tensor | None = None
     next_returns: th.Tensor | None = None
+    first_rewards: th.Tensor | None = None
+    next_actions: th.Tensor | None = None
+    next_indices: Index | None = None
 
 
 def name_columns(
-    replay_data: ReplayBufferSamples | PrioritizedReplayBufferSamples, action_space: HybridBox, gamma: float
+    replay_data: ReplayBufferSamples | PrioritizedReplayBufferSamples | WatkinsReplayBufferSamples,
+    action_space: HybridBox,
+    gamma: float,
 ) -> HybridReplaySamples:
     """
     :param replay_data: what ``ReplayBuffer.sample`` returned
@@ -60,6 +67,9 @@ def name_columns(
         discounts=gamma if replay_data.discounts is None else replay_data.discounts,
         weights=getattr(replay_data, "weights", 1.0),
         indices=getattr(replay_data, "indices", None),
+        first_rewards=getattr(replay_data, "first_rewards", None),
+        next_actions=getattr(replay_data, "next_actions", None),
+        next_indices=getattr(replay_data, "next_indices", None),
         **{
             name: columns.masks(rows, name) if name in MASK_PARTS else columns.view(rows, name)
             for name in action_space.state_parts

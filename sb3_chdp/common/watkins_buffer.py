@@ -1,0 +1,99 @@
+"""n-step returns that end before an action that costs much."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_chdp.common.buffers import Index
+from sb3_chdp.common.n_step_buffer import HybridNStepReplayBuffer
+
+# Probability that a return goes on after a step, and most steps that one has
+DECAY, MAX_STEPS = 0.9, 20
+
+
+class WatkinsReplayBufferSamples(NamedTuple):
+    """
+    SB3's ``ReplayBufferSamples`` of n-step returns, where n differs from one to the next, with the (B, 1) rewards of the first
+    steps, and the (B, columns) actions that were taken after the last ones, and where these are stored.
+    """
+
+    observations: th.Tensor
+    actions: th.Tensor
+    next_observations: th.Tensor
+    dones: th.Tensor
+    rewards: th.Tensor
+    discounts: th.Tensor
+    first_rewards: th.Tensor
+    next_actions: th.Tensor
+    next_indices: Index
+
+
+class WatkinsReplayBuffer(HybridNStepReplayBuffer):
+    """
+    Replay buffer of n-step returns that end before actions which are worse than the best ones of their states.
+
+    A return goes on for as long as these actions cost no more than ``tolerance`` in all. Where an action matters little, a
+    time step is short beside what happens, say, this is many steps, and critics hear soon of what comes in the end. Where each
+    matters it is one. Costs are asked for again now and then: returns end at random, too, with probability 1 - ``DECAY`` after
+    each step.
+
+    Source: the cuts of Q(lambda) (Watkins, 1989), there at every action that is not the best, and its returns' geometric
+    lengths.
+
+    :param args: those of :class:`stable_baselines3.common.buffers.NStepReplayBuffer`
+    :param n_steps: largest number of steps
+    :param kwargs: those of :class:`stable_baselines3.common.buffers.NStepReplayBuffer`
+
+    :ivar costs: (buffer_size, n_envs) by how much the actions were worth less than the best ones when :meth:`update_costs` was
+        last told, infinity before
+    :ivar tolerance: sum of costs up to which a return goes on
+    """
+
+    def __init__(self, *args: Any, n_steps: int = MAX_STEPS, **kwargs: Any):
+        super().__init__(*args, n_steps=n_steps, **kwargs)
+        self.costs = np.full((self.buffer_size, self.n_envs), np.inf, dtype=np.float32)
+        self.tolerance = 0.0
+
+    def add(self, *args: Any, **kwargs: Any) -> None:
+        """See :meth:`stable_baselines3.common.buffers.ReplayBuffer.add`."""
+        self.costs[self.pos] = np.inf
+        super().add(*args, **kwargs)
+
+    def update_costs(self, indices: Index, costs: th.Tensor) -> None:
+        """
+        :param indices: ``next_indices`` of a batch. Those behind the end of an episode or of the data count for nothing
+        :param costs: (B, 1) by how much its ``next_actions`` are worth less than the best ones
+        """
+        self.costs[indices] = costs[:, 0].clamp(min=0).cpu().numpy()
+
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> WatkinsReplayBufferSamples:  # type: ignore[override]
+        envs = np.random.randint(0, self.n_envs, size=batch_inds.shape)
+        steps = (batch_inds[:, None] + np.arange(self.n_steps)) % self.buffer_size
+        index = steps, envs[:, None]
+
+        # What follows the newest transition is not its future
+        ends = (self.dones[index] + self.timeouts[index] > 0) | (steps == (self.pos - 1) % self.buffer_size)
+        goes_on = ~ends[:, :-1] & (np.cumsum(self.costs[index][:, 1:], axis=1) <= self.tolerance)
+        goes_on &= np.random.random(goes_on.shape) < DECAY
+        n = 1 + np.logical_and.accumulate(goes_on, axis=1).sum(axis=1)
+        rewards = self._normalize_reward(self.rewards[index], env)
+        counts = (np.arange(self.n_steps) < n[:, None]) * self.gamma ** np.arange(self.n_steps)
+
+        last = (batch_inds + n - 1) % self.buffer_size
+        following = (last + 1) % self.buffer_size, envs
+        actions = self.to_torch(self.actions[batch_inds, envs])
+        self._tell_last(actions, self.to_torch(self.actions[last, envs]))
+        return WatkinsReplayBufferSamples(
+            observations=self.to_torch(self._normalize_obs(self.observations[batch_inds, envs], env)),  # type: ignore[arg-type]
+            actions=actions,
+            next_observations=self.to_torch(self._normalize_obs(self.next_observations[last, envs], env)),  # type: ignore[arg-type]
+            # Only use dones that are not due to timeouts
+            dones=self.to_torch(self.dones[last, envs] * (1 - self.timeouts[last, envs]))[:, None],
+            rewards=self.to_torch((rewards * counts).sum(axis=1, keepdims=True).astype(np.float32)),
+            discounts=self.to_torch((self.gamma ** n[:, None]).astype(np.float32)),
+            first_rewards=self.to_torch(rewards[:, :1]),
+            next_actions=self.to_torch(self.actions[following]),
+            next_indices=following,
+        )

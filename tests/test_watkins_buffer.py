@@ -1,0 +1,126 @@
+"""n-step returns that end before costly actions: how long they are, what they hold, and what costs are."""
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_chdp import CHDP
+from sb3_chdp.chdp import PaperCHDP
+from sb3_chdp.chdp.chdp import LARGEST_COST
+from sb3_chdp.common import watkins_buffer
+from sb3_chdp.common.watkins_buffer import WatkinsReplayBuffer
+from tests.algorithms import fast_model, filled_model, sample
+from tests.hybrid_envs import HybridIdentityEnv
+from tests.test_returns import counting_env
+
+GAMMA = 0.9
+
+
+@pytest.fixture
+def endless(monkeypatch):
+    """Returns do not end at random."""
+    monkeypatch.setattr(watkins_buffer, "DECAY", 1.0)
+
+
+def batch_of(model, costs, tolerance=0.0, n=400):
+    """:return: a batch if all stored actions have the given costs"""
+    model.replay_buffer.costs[:] = costs
+    model.replay_buffer.tolerance = tolerance
+    return sample(model, n)
+
+
+def counting_model(*lengths, n_transitions=80, **kwargs):
+    """Rewards are 1, 2, 3 and so on, and so are the last returns of the rows."""
+    return filled_model(counting_env(*lengths), n_transitions=n_transitions, gamma=GAMMA, **kwargs)
+
+
+def test_costless_actions_are_passed_until_the_episode_ends(endless):
+    data = batch_of(counting_model(4, 2), 0.0)
+    lengths = [round(n) for n in (data.discounts[:, 0].log() / np.log(GAMMA)).tolist()]
+    first = data.first_rewards[:, 0].tolist()
+    values = [sum(GAMMA**i * (reward + i) for i in range(n)) for reward, n in zip(first, lengths, strict=True)]
+    np.testing.assert_allclose(data.rewards[:, 0], values, rtol=1e-5)
+    # Of an episode of 4 steps and of one of 2; the newest transitions are the end of what is known
+    assert {(1, 4), (2, 3), (3, 2), (4, 1), (1, 2), (2, 1)} <= set(zip(first, lengths, strict=True))
+    # What rows say about the next state is that of the last step
+    assert {10, 3} <= set(data.next_returns[:, 0].tolist()) <= {10, 3, 6, 1}
+
+
+def test_at_most_so_many_steps(endless):
+    model = counting_model(50, replay_buffer_class=WatkinsReplayBuffer, replay_buffer_kwargs=dict(n_steps=3))
+    assert batch_of(model, 0.0).discounts.min() == pytest.approx(GAMMA**3)
+
+
+@pytest.mark.parametrize("cost, n", [(np.inf, 1), (0.6, 2), (0.4, 3), (0.3, 4)])
+def test_returns_end_before_what_costs_too_much(endless, cost, n):
+    """The action that is valued itself may cost what it likes."""
+    data = batch_of(counting_model(50), cost, tolerance=1.0)
+    assert data.discounts.min() == pytest.approx(GAMMA**n)
+    assert (data.discounts == data.discounts.min()).float().mean() > 0.8
+
+
+def test_returns_end_at_random():
+    """After each step, so that costs are asked for again."""
+    data = batch_of(counting_model(80), 0.0, n=20_000)
+    assert (data.discounts == GAMMA).float().mean() == pytest.approx(1 - watkins_buffer.DECAY, abs=0.03)
+
+
+def test_new_transitions_have_unknown_costs():
+    model = counting_model(4)
+    model.replay_buffer.costs[:] = 0
+    before = model.replay_buffer.pos
+    model.learn(3, reset_num_timesteps=False)
+    costs = model.replay_buffer.costs[before : model.replay_buffer.pos, 0]
+    assert len(costs) == 3 and costs[-1] == np.inf
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_costs_are_those_of_the_actions_that_followed(n_envs):
+    """By how much the critics value them less than what the target policies would do."""
+    model = filled_model(counting_env(*[50] * n_envs), n_transitions=90)
+    buffer = model.replay_buffer
+    data = sample(model, 60)
+    times, envs = data.next_indices
+    np.testing.assert_array_equal(data.next_actions, buffer.actions[times, envs])
+    buffer.update_costs(data.next_indices, th.arange(60.0)[:, None] - 1)
+    assert buffer.costs[times[-1], envs[-1]] == 58 and buffer.costs.min() >= 0
+    assert np.isinf(buffer.costs).any()
+
+    model.train(30, 64)
+    assert np.isfinite(buffer.costs[1 : buffer.pos]).mean() > 0.9
+    assert buffer.tolerance == LARGEST_COST
+
+
+def test_without_foresight_returns_have_one_step(monkeypatch):
+    model = filled_model()
+    monkeypatch.setattr(type(model.foresight_sums), "weight", lambda self: 0.0)
+    model.train(1, 16)
+    assert model.replay_buffer.tolerance == 0
+
+
+def test_rewards_are_normalised():
+    model = filled_model(VecNormalize(counting_env(50)), n_transitions=40)
+    model._vec_normalize_env.ret_rms.var = np.array(4.0)
+    data = batch_of(model, np.inf)
+    assert set(data.rewards[:, 0].tolist()) == set(data.first_rewards[:, 0].tolist())
+    assert data.rewards.max() == pytest.approx(min(40 / 2, 10), rel=1e-3)
+
+
+def test_it_is_the_default_where_n_step_returns_are_possible():
+    assert isinstance(fast_model().replay_buffer, WatkinsReplayBuffer)
+    assert type(fast_model(n_steps=3).replay_buffer) is not WatkinsReplayBuffer
+    assert isinstance(fast_model(n_steps=3).replay_buffer, NStepReplayBuffer)
+    assert type(fast_model(replay_buffer_class=ReplayBuffer).replay_buffer) is ReplayBuffer
+    assert type(fast_model(algorithm_class=PaperCHDP).replay_buffer) is ReplayBuffer
+    frugal = dict(optimize_memory_usage=True, replay_buffer_kwargs=dict(handle_timeout_termination=False))
+    assert type(fast_model(**frugal).replay_buffer) is ReplayBuffer
+
+
+def test_saved_costs(tmp_path):
+    model = CHDP("MlpPolicy", HybridIdentityEnv(), learning_starts=20, n_diffusion_steps=2, batch_size=8).learn(60)
+    model.save_replay_buffer(tmp_path / "buffer")
+    other = CHDP("MlpPolicy", HybridIdentityEnv())
+    other.load_replay_buffer(tmp_path / "buffer")
+    np.testing.assert_array_equal(other.replay_buffer.costs, model.replay_buffer.costs)
