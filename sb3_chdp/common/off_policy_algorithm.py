@@ -69,7 +69,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         "replay_buffer_class": optional(Accepted("a class of replay buffers", lambda value: is_class_of(value, ReplayBuffer))),
         "replay_buffer_kwargs": optional(A_DICT),
     }
-    # Where SB3's n-step buffers work, and the user asks for none; None: SB3's
+    # Replay buffer where the user names none and n-step returns are possible; None: SB3's
     default_buffer_class: ClassVar[type[ReplayBuffer] | None] = None
     policy: HybridPolicy
     # Those of the policy

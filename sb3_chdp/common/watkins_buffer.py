@@ -34,10 +34,9 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
     """
     Replay buffer of n-step returns that end before actions which are worse than the best ones of their states.
 
-    A return goes on for as long as these actions cost no more than ``tolerance`` in all. Where an action matters little, a
-    time step is short beside what happens, say, this is many steps, and critics hear soon of what comes in the end. Where each
-    matters it is one. Costs are asked for again now and then: returns end at random, too, with probability 1 - ``DECAY`` after
-    each step.
+    A return goes on for as long as these actions cost no more than ``tolerance`` in all. Where each action matters, it has one
+    step. Where an action matters little, as in a short time step, it has many: critics hear soon of what comes in the end.
+    Returns end at random, too, with probability 1 - ``DECAY`` after each step, so that all costs are asked for again.
 
     Source: the cuts of Q(lambda) (Watkins, 1989), there at every action that is not the best, and its returns' geometric
     lengths.
