@@ -148,7 +148,7 @@ class WithoutReturns(CHDP):
 class WithoutLongReturns(CHDP):
     """Returns of one step."""
 
-    default_buffer_class: ClassVar[type[ReplayBuffer] | None] = None
+    default_buffer_classes: ClassVar[tuple[type[ReplayBuffer], type[ReplayBuffer]] | None] = None
 
 
 class WithoutUniform(CHDP):

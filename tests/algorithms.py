@@ -49,10 +49,10 @@ FAST_CHDP = dict(
 PAPER_FAST = {key: value for key, value in FAST_CHDP.items() if key != "n_action_candidates"}
 
 
-def fast_model(algorithm_class=CHDP, env=None, **kwargs):
+def fast_model(algorithm_class=CHDP, env=None, policy="MlpPolicy", **kwargs):
     """A small model of CHDP, or of a class derived from it."""
     settings = PAPER_FAST if issubclass(algorithm_class, PaperCHDP) else FAST_CHDP
-    return algorithm_class("MlpPolicy", env or HybridIdentityEnv(), **{**settings, **kwargs})
+    return algorithm_class(policy, env or HybridIdentityEnv(), **{**settings, **kwargs})
 
 
 def filled_model(env=None, algorithm_class=CHDP, n_transitions=60, **kwargs):

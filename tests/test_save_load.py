@@ -172,7 +172,7 @@ def test_n_step_returns_follow_the_arguments_of_load(off_policy_algorithm, tmp_p
         one = off_policy_algorithm.load(tmp_path / "model", n_steps=1)
     assert (same.replay_buffer.n_steps, same.replay_buffer.gamma) == (3, same.gamma)
     assert (other.replay_buffer.n_steps, other.replay_buffer.gamma) == (5, 0.5)
-    assert type(one.replay_buffer) is (off_policy_algorithm.default_buffer_class or ReplayBuffer)
+    assert type(one.replay_buffer) is (off_policy_algorithm.default_buffer_classes or [ReplayBuffer])[0]
 
 
 def test_wrong_policy_kwargs_at_load(algorithm, tmp_path):

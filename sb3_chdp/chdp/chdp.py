@@ -25,7 +25,7 @@ from sb3_chdp.common.arguments import NOT_NEGATIVE, Accepted, of_networks, warn_
 from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.samples import HybridReplaySamples
 from sb3_chdp.common.utils import gradient_step
-from sb3_chdp.common.watkins_buffer import WatkinsReplayBuffer
+from sb3_chdp.common.watkins_buffer import WatkinsDictReplayBuffer, WatkinsReplayBuffer
 
 # High at first, and 0 in the end: what is learnt settles
 LEARNING_RATE = LinearSchedule(1e-3, 0.0, 1.0)
@@ -119,7 +119,10 @@ class CHDP(ExploringAlgorithm):
     # Bound on the gradient norm of an optimizer. Most batches of the critics reach it, and count alike: with a wider one they
     # forget now and then what they had learnt
     max_grad_norm: ClassVar[float] = 1.0
-    default_buffer_class: ClassVar[type[ReplayBuffer] | None] = WatkinsReplayBuffer
+    default_buffer_classes: ClassVar[tuple[type[ReplayBuffer], type[ReplayBuffer]] | None] = (
+        WatkinsReplayBuffer,
+        WatkinsDictReplayBuffer,
+    )
 
     policy: CHDPPolicy
     actor: CooperativeActor

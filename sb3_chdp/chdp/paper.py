@@ -176,7 +176,7 @@ class PaperCHDP(CHDP):
     uniform_fraction: ClassVar[float] = 0.0
     critics_train_codebook: ClassVar[bool] = False
     knows_returns: ClassVar[bool] = False
-    default_buffer_class: ClassVar[type[ReplayBuffer] | None] = None
+    default_buffer_classes: ClassVar[tuple[type[ReplayBuffer], type[ReplayBuffer]] | None] = None
 
     def __init__(
         self,

@@ -20,6 +20,25 @@ BLOCK = 1024
 Index = tuple[np.ndarray, np.ndarray]
 
 
+def observations_at(
+    buffer: ReplayBuffer, observations: np.ndarray | dict[str, np.ndarray], index: Index, env: VecNormalize | None
+) -> PyTorchObs:
+    """
+    :param buffer: a replay buffer
+    :param observations: its (buffer_size, n_envs, ...) observations or next observations, of dicts those of each part
+    :param index: B places in it
+    :param env: VecEnv that normalises observations
+    :return: (B, ...) tensors
+    """
+    if isinstance(observations, dict):
+        parts = buffer._normalize_obs({key: part[index] for key, part in observations.items()}, env)
+        assert isinstance(parts, dict)
+        return {key: buffer.to_torch(part) for key, part in parts.items()}
+    part = buffer._normalize_obs(observations[index], env)
+    assert isinstance(part, np.ndarray)
+    return buffer.to_torch(part)
+
+
 class PrioritizedReplayBufferSamples(NamedTuple):
     """SB3's ``ReplayBufferSamples``, the (B, 1) importance weights in (0, 1], and where the transitions are stored."""
 
@@ -95,9 +114,9 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         index, probabilities = self._draw(batch_size)
         weights = (self.size() * self.n_envs * probabilities) ** -self.beta
         return PrioritizedReplayBufferSamples(
-            observations=self._observations_at(self.observations, index, env),
+            observations=observations_at(self, self.observations, index, env),
             actions=self.to_torch(self.actions[index]),
-            next_observations=self._observations_at(self.next_observations, index, env),
+            next_observations=observations_at(self, self.next_observations, index, env),
             # Only use dones that are not due to timeouts
             dones=self.to_torch(self.dones[index] * (1 - self.timeouts[index])).reshape(-1, 1),
             rewards=self.to_torch(self._normalize_reward(self.rewards[index].reshape(-1, 1), env)),
@@ -128,17 +147,6 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         # Rounding may lead beyond the last transition
         flat = np.minimum(flat, self.size() * self.n_envs - 1)
         return (flat // self.n_envs, flat % self.n_envs), self._priorities[flat] / ends[-1]
-
-    def _observations_at(
-        self, observations: np.ndarray | dict[str, np.ndarray], index: Index, env: VecNormalize | None
-    ) -> PyTorchObs:
-        if isinstance(observations, dict):
-            parts = self._normalize_obs({key: part[index] for key, part in observations.items()}, env)
-            assert isinstance(parts, dict)
-            return {key: self.to_torch(part) for key, part in parts.items()}
-        part = self._normalize_obs(observations[index], env)
-        assert isinstance(part, np.ndarray)
-        return self.to_torch(part)
 
 
 class PrioritizedDictReplayBuffer(PrioritizedReplayBuffer, DictReplayBuffer):  # type: ignore[misc]

@@ -69,8 +69,8 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         "replay_buffer_class": optional(Accepted("a class of replay buffers", lambda value: is_class_of(value, ReplayBuffer))),
         "replay_buffer_kwargs": optional(A_DICT),
     }
-    # Replay buffer where the user names none and n-step returns are possible; None: SB3's
-    default_buffer_class: ClassVar[type[ReplayBuffer] | None] = None
+    # Replay buffers, that of dict observations second, where the user names none; None: SB3's
+    default_buffer_classes: ClassVar[tuple[type[ReplayBuffer], type[ReplayBuffer]] | None] = None
     policy: HybridPolicy
     # Those of the policy
     actor: Any
@@ -98,7 +98,8 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         try:
             with warnings.catch_warnings():
                 has_dicts = isinstance(self.observation_space, spaces.Dict)
-                default = None if has_dicts or self.optimize_memory_usage else self.default_buffer_class
+                defaults = None if self.optimize_memory_usage else self.default_buffer_classes
+                default = defaults and defaults[has_dicts]
                 settings = n_step_settings(given[0], given[1] or {}, self.n_steps, self.gamma, has_dicts, default)
                 self.replay_buffer_class, self.replay_buffer_kwargs = settings
                 if is_class_of(self.replay_buffer_class, NStepReplayBuffer):

@@ -4,9 +4,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.buffers import DictReplayBuffer
+from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_chdp.common.buffers import Index
+from sb3_chdp.common.buffers import Index, observations_at
 from sb3_chdp.common.n_step_buffer import HybridNStepReplayBuffer
 
 # Probability that a return goes on after a step, and most steps that one has
@@ -19,9 +21,9 @@ class WatkinsReplayBufferSamples(NamedTuple):
     steps, and the (B, columns) actions that were taken after the last ones, and where these are stored.
     """
 
-    observations: th.Tensor
+    observations: PyTorchObs
     actions: th.Tensor
-    next_observations: th.Tensor
+    next_observations: PyTorchObs
     dones: th.Tensor
     rewards: th.Tensor
     discounts: th.Tensor
@@ -85,9 +87,9 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
         actions = self.to_torch(self.actions[batch_inds, envs])
         self._tell_last(actions, self.to_torch(self.actions[last, envs]))
         return WatkinsReplayBufferSamples(
-            observations=self.to_torch(self._normalize_obs(self.observations[batch_inds, envs], env)),  # type: ignore[arg-type]
+            observations=observations_at(self, self.observations, (batch_inds, envs), env),
             actions=actions,
-            next_observations=self.to_torch(self._normalize_obs(self.next_observations[last, envs], env)),  # type: ignore[arg-type]
+            next_observations=observations_at(self, self.next_observations, (last, envs), env),
             # Only use dones that are not due to timeouts
             dones=self.to_torch(self.dones[last, envs] * (1 - self.timeouts[last, envs]))[:, None],
             rewards=self.to_torch((rewards * counts).sum(axis=1, keepdims=True).astype(np.float32)),
@@ -96,3 +98,7 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
             next_actions=self.to_torch(self.actions[following]),
             next_indices=following,
         )
+
+
+class WatkinsDictReplayBuffer(WatkinsReplayBuffer, DictReplayBuffer):  # type: ignore[misc]
+    """:class:`WatkinsReplayBuffer` for dict observations."""
