@@ -29,8 +29,8 @@ from sb3_chdp.common.watkins_buffer import WatkinsDictReplayBuffer, WatkinsRepla
 
 # High at first, and 0 in the end: what is learnt settles
 LEARNING_RATE = LinearSchedule(1e-3, 0.0, 1.0)
-# What actions on the way may cost in an n-step return, in the critics' units, where what follows counts in full
-LARGEST_COST = 0.1
+# What a random action and those on the way may cost in an n-step return, in the critics' units, with full foresight
+LARGEST_COST = 0.2
 
 
 class CHDP(ExploringAlgorithm):

@@ -13,6 +13,8 @@ from sb3_chdp.common.n_step_buffer import HybridNStepReplayBuffer
 
 # Probability that a return goes on after a step, and most steps that one has
 DECAY, MAX_STEPS = 0.9, 20
+# Weight of a batch in the running mean of what random actions cost
+COST_RATE = 0.05
 
 
 class WatkinsReplayBufferSamples(NamedTuple):
@@ -36,9 +38,10 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
     """
     Replay buffer of n-step returns that end before actions which are worse than the best ones of their states.
 
-    A return goes on for as long as these actions cost no more than ``tolerance`` in all. Where each action matters, it has one
-    step. Where an action matters little, as in a short time step, it has many: critics hear soon of what comes in the end.
-    Returns end at random, too, with probability 1 - ``DECAY`` after each step, so that all costs are asked for again.
+    A return goes on for as long as these actions and a random one cost no more than ``tolerance`` in all. Where each action
+    decides, a random one alone costs more, and returns have one step. Where an action matters little, as in a short time
+    step, they have many: critics hear soon of what comes in the end. Returns end at random, too, with probability 1 -
+    ``DECAY`` after each step, so that all costs are asked for again.
 
     Source: the cuts of Q(lambda) (Watkins, 1989), there at every action that is not the best, and its returns' geometric
     lengths.
@@ -49,12 +52,14 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
 
     :ivar costs: (buffer_size, n_envs) by how much the actions were worth less than the best ones when :meth:`update_costs` was
         last told, infinity before
+    :ivar random_cost: running mean of that of random actions, infinity before
     :ivar tolerance: sum of costs up to which a return goes on
     """
 
     def __init__(self, *args: Any, n_steps: int = MAX_STEPS, **kwargs: Any):
         super().__init__(*args, n_steps=n_steps, **kwargs)
         self.costs = np.full((self.buffer_size, self.n_envs), np.inf, dtype=np.float32)
+        self.random_cost = np.inf
         self.tolerance = 0.0
 
     def add(self, *args: Any, **kwargs: Any) -> None:
@@ -65,9 +70,12 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
     def update_costs(self, indices: Index, costs: th.Tensor) -> None:
         """
         :param indices: ``next_indices`` of a batch. Those behind the end of an episode or of the data count for nothing
-        :param costs: (B, 1) by how much its ``next_actions`` are worth less than the best ones
+        :param costs: (B, 2) by how much its ``next_actions`` and random ones are worth less than the best ones
         """
-        self.costs[indices] = costs[:, 0].clamp(min=0).cpu().numpy()
+        of_stored, of_random = costs.clamp(min=0).cpu().numpy().T
+        self.costs[indices] = of_stored
+        mean = float(of_random.mean())
+        self.random_cost = mean if np.isinf(self.random_cost) else self.random_cost + COST_RATE * (mean - self.random_cost)
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> WatkinsReplayBufferSamples:  # type: ignore[override]
         envs = np.random.randint(0, self.n_envs, size=batch_inds.shape)
@@ -76,7 +84,8 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
 
         # What follows the newest transition is not its future
         ends = (self.dones[index] + self.timeouts[index] > 0) | (steps == (self.pos - 1) % self.buffer_size)
-        goes_on = ~ends[:, :-1] & (np.cumsum(self.costs[index][:, 1:], axis=1) <= self.tolerance)
+        costs = self.random_cost + np.cumsum(self.costs[index][:, 1:], axis=1)
+        goes_on = ~ends[:, :-1] & (costs <= self.tolerance)
         goes_on &= np.random.random(goes_on.shape) < DECAY
         n = 1 + np.logical_and.accumulate(goes_on, axis=1).sum(axis=1)
         rewards = self._normalize_reward(self.rewards[index], env)
