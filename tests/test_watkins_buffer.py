@@ -112,13 +112,18 @@ def test_costs_are_those_of_the_actions_that_followed(n_envs):
     data = sample(model, 60)
     times, envs = data.next_indices
     np.testing.assert_array_equal(data.next_actions, buffer.actions[times, envs])
-    buffer.update_costs(data.next_indices, th.stack([th.arange(60.0) - 1, th.full((60,), 2.0)], dim=1))
+    goes_on = th.zeros(60, 1)
+    buffer.update_costs(data.next_indices, th.stack([th.arange(60.0) - 1, th.full((60,), 2.0)], dim=1), goes_on)
     assert buffer.costs[times[-1], envs[-1]] == 58 and buffer.costs.min() >= 0
     assert np.isinf(buffer.costs).any()
     # A running mean
     assert buffer.random_cost == 2
-    buffer.update_costs(data.next_indices, th.full((60, 2), 4.0))
+    buffer.update_costs(data.next_indices, th.full((60, 2), 4.0), goes_on)
     assert buffer.random_cost == pytest.approx(2 + 2 * watkins_buffer.COST_RATE)
+    # Nothing follows the end of an episode
+    before = buffer.random_cost
+    buffer.update_costs(data.next_indices, th.full((60, 2), 9.0), 1 - goes_on)
+    assert buffer.random_cost == before
 
     model.train(30, 64)
     assert np.isfinite(buffer.costs[1 : buffer.pos]).mean() > 0.9
@@ -140,7 +145,12 @@ def test_rewards_are_normalised():
     assert data.rewards.max() == pytest.approx(min(40 / 2, 10), rel=1e-3)
 
 
-def test_it_is_the_default_where_n_step_returns_are_possible():
+def test_dict_observations_need_another_class():
+    with pytest.raises(ValueError, match="replay_buffer_class must be WatkinsDictReplayBuffer for dict observations"):
+        fast_model(env=GoalEnv(), policy="MultiInputPolicy", replay_buffer_class=WatkinsReplayBuffer)
+
+
+def test_it_is_the_default():
     assert isinstance(fast_model().replay_buffer, WatkinsReplayBuffer)
     assert type(fast_model(n_steps=3).replay_buffer) is not WatkinsReplayBuffer
     assert isinstance(fast_model(n_steps=3).replay_buffer, NStepReplayBuffer)
@@ -177,8 +187,11 @@ def test_dict_observations():
     times, envs = data.next_indices
     for key, part in data.next_observations.items():
         np.testing.assert_array_equal(part, buffer.next_observations[key][times - 1, envs])
+        stored = buffer.observations[key][: buffer.pos, 0]
+        assert all((stored == obs.numpy()).all(axis=1).any() for obs in data.observations[key])
+    buffer.costs[:] = buffer.random_cost = np.inf
     model.train(5, 16)
-    assert np.isfinite(buffer.costs).any()
+    assert np.isfinite(buffer.costs).any() and np.isfinite(buffer.random_cost)
 
 
 def test_saved_costs(tmp_path):

@@ -20,6 +20,17 @@ BLOCK = 1024
 Index = tuple[np.ndarray, np.ndarray]
 
 
+def check_takes(buffer: ReplayBuffer, observation_space: spaces.Space[Any], of_dicts: str) -> None:
+    """
+    :param buffer: a replay buffer
+    :param observation_space: the space of its observations
+    :param of_dicts: name of the class for dict observations
+    :raises ValueError: for dict observations, unless the buffer is of dicts
+    """
+    if isinstance(observation_space, spaces.Dict) and not isinstance(buffer, DictReplayBuffer):
+        raise ValueError(f"replay_buffer_class must be {of_dicts} for dict observations, got {type(buffer).__name__}")
+
+
 def observations_at(
     buffer: ReplayBuffer, observations: np.ndarray | dict[str, np.ndarray], index: Index, env: VecNormalize | None
 ) -> PyTorchObs:
@@ -81,10 +92,7 @@ class PrioritizedReplayBuffer(ReplayBuffer):
         beta: float = 0.4,
         **kwargs: Any,
     ):
-        if isinstance(observation_space, spaces.Dict) and not isinstance(self, DictReplayBuffer):
-            raise ValueError(
-                "replay_buffer_class must be PrioritizedDictReplayBuffer for dict observations, got PrioritizedReplayBuffer"
-            )
+        check_takes(self, observation_space, "PrioritizedDictReplayBuffer")
         super().__init__(buffer_size, observation_space, *args, **kwargs)
         if self.optimize_memory_usage:
             raise ValueError(f"{type(self).__name__} does not support optimize_memory_usage=True")

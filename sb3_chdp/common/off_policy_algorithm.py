@@ -69,7 +69,7 @@ class HybridOffPolicyAlgorithm(HybridAlgorithm, OffPolicyAlgorithm):
         "replay_buffer_class": optional(Accepted("a class of replay buffers", lambda value: is_class_of(value, ReplayBuffer))),
         "replay_buffer_kwargs": optional(A_DICT),
     }
-    # Replay buffers, that of dict observations second, where the user names none; None: SB3's
+    # Replay buffers where the user names none, that of dict observations second; None or to save memory: SB3's
     default_buffer_classes: ClassVar[tuple[type[ReplayBuffer], type[ReplayBuffer]] | None] = None
     policy: HybridPolicy
     # Those of the policy

@@ -4,11 +4,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_chdp.common.buffers import Index, observations_at
+from sb3_chdp.common.buffers import Index, check_takes, observations_at
 from sb3_chdp.common.n_step_buffer import HybridNStepReplayBuffer
 
 # Probability that a return goes on after a step, and most steps that one has
@@ -38,10 +39,10 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
     """
     Replay buffer of n-step returns that end before actions which are worse than the best ones of their states.
 
-    A return goes on for as long as these actions and a random one cost no more than ``tolerance`` in all. Where each action
-    decides, a random one alone costs more, and returns have one step. Where an action matters little, as in a short time
-    step, they have many: critics hear soon of what comes in the end. Returns end at random, too, with probability 1 -
-    ``DECAY`` after each step, so that all costs are asked for again.
+    A return goes on for as long as these actions, and a random one in the mean over all states, cost no more than
+    ``tolerance`` in all. If each action decides, a random one alone costs more, and returns have one step. If an action
+    matters little, as in a short time step, they have many: critics hear soon of what comes in the end. Returns end at
+    random, too, with probability 1 - ``DECAY`` after each step, so that all costs are asked for again.
 
     Source: the cuts of Q(lambda) (Watkins, 1989), there at every action that is not the best, and its returns' geometric
     lengths.
@@ -49,15 +50,19 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
     :param args: those of :class:`stable_baselines3.common.buffers.NStepReplayBuffer`
     :param n_steps: largest number of steps
     :param kwargs: those of :class:`stable_baselines3.common.buffers.NStepReplayBuffer`
+    :raises ValueError: for dict observations, which need :class:`WatkinsDictReplayBuffer`
 
     :ivar costs: (buffer_size, n_envs) by how much the actions were worth less than the best ones when :meth:`update_costs` was
         last told, infinity before
-    :ivar random_cost: running mean of that of random actions, infinity before
+    :ivar random_cost: running mean of that of random actions over states, infinity before
     :ivar tolerance: sum of costs up to which a return goes on
     """
 
-    def __init__(self, *args: Any, n_steps: int = MAX_STEPS, **kwargs: Any):
-        super().__init__(*args, n_steps=n_steps, **kwargs)
+    def __init__(
+        self, buffer_size: int, observation_space: spaces.Space[Any], *args: Any, n_steps: int = MAX_STEPS, **kwargs: Any
+    ):
+        check_takes(self, observation_space, "WatkinsDictReplayBuffer")
+        super().__init__(buffer_size, observation_space, *args, n_steps=n_steps, **kwargs)
         self.costs = np.full((self.buffer_size, self.n_envs), np.inf, dtype=np.float32)
         self.random_cost = np.inf
         self.tolerance = 0.0
@@ -67,15 +72,18 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
         self.costs[self.pos] = np.inf
         super().add(*args, **kwargs)
 
-    def update_costs(self, indices: Index, costs: th.Tensor) -> None:
+    def update_costs(self, indices: Index, costs: th.Tensor, dones: th.Tensor) -> None:
         """
         :param indices: ``next_indices`` of a batch. Those behind the end of an episode or of the data count for nothing
-        :param costs: (B, 2) by how much its ``next_actions`` and random ones are worth less than the best ones
+        :param costs: (B, 2) by how much its ``next_actions`` and random ones are worth less than the best ones; below 0 is 0
+        :param dones: (B, 1) its dones: where the episode has ended critics learn no values
         """
         of_stored, of_random = costs.clamp(min=0).cpu().numpy().T
         self.costs[indices] = of_stored
-        mean = float(of_random.mean())
-        self.random_cost = mean if np.isinf(self.random_cost) else self.random_cost + COST_RATE * (mean - self.random_cost)
+        of_random = of_random[dones[:, 0].cpu().numpy() == 0]
+        if len(of_random) > 0:
+            before, mean = self.random_cost, float(of_random.mean())
+            self.random_cost = before + COST_RATE * (mean - before) if np.isfinite(before) else mean
 
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> WatkinsReplayBufferSamples:  # type: ignore[override]
         envs = np.random.randint(0, self.n_envs, size=batch_inds.shape)
