@@ -59,8 +59,8 @@ def distance_of_groups(algorithm_class):
 
     :return: distance of the mean codewords of the two groups after training, relative to the spread within them
     """
-    settings = dict(gamma=0.0, codebook_lr_factor=10.0, latent_dim=8, replay_buffer_class=ReplayBuffer)
-    model = filled_model(many_actions(16), algorithm_class, **settings)
+    kwargs = dict(gamma=0.0, codebook_lr_factor=10.0, latent_dim=8, replay_buffer_class=ReplayBuffer)
+    model = filled_model(many_actions(16), algorithm_class, **kwargs)
     buffer = model.replay_buffer
     buffer.rewards[:] = 2 * (buffer.actions[:, :, 0] % 2) - 1
     model.train(300, 32)

@@ -55,7 +55,7 @@ class CHDP(ExploringAlgorithm):
         4. the values of next states depend on what the episode has returned so far, see :class:`ReturnNetwork`;
         5. of several actions the one that critics value most acts; while training, those that they disagree about are tried,
            see :class:`Selection`; in targets it is the next action, with a small share of a random one, :func:`next_values`;
-        6. returns in targets go on over actions that cost little, see :class:`WatkinsReplayBuffer`;
+        6. returns in targets have several steps where actions cost little, see :class:`WatkinsReplayBuffer`;
         7. the discrete policy is improved by comparing a few discrete actions, each with the parameters that the continuous
            policy draws for it, see :func:`discrete_policy_loss`, and the continuous policy for uniformly random ones too;
         8. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate`,
