@@ -12,7 +12,7 @@ from sb3_chdp import CHDP
 from sb3_chdp.chdp import PaperCHDP
 from sb3_chdp.chdp.chdp import LARGEST_COST
 from sb3_chdp.common import watkins_buffer
-from sb3_chdp.common.watkins_buffer import WatkinsDictReplayBuffer, WatkinsReplayBuffer
+from sb3_chdp.common.watkins_buffer import WatkinsDictReplayBuffer, WatkinsReplayBuffer, change_rate
 from tests.algorithms import fast_model, filled_model, sample
 from tests.hybrid_envs import GoalEnv, HybridIdentityEnv, layouts
 from tests.test_returns import counting_env
@@ -44,8 +44,9 @@ def endless(monkeypatch):
     monkeypatch.setattr(watkins_buffer, "DECAY", 1.0)
 
 
-def batch_of(model, costs, tolerance=0.0, n=400, random_cost=0.0):
-    """:return: a batch if all stored actions have the given costs, and random ones on average"""
+def batch_of(model, costs, tolerance=0.0, n=400, random_cost=0.0, change_rate=0.0):
+    """:return: a batch if all stored actions have the given costs, random ones on average, and observations change so fast"""
+    model.replay_buffer.change_rate, model.replay_buffer.n_seen = change_rate, np.inf
     model.replay_buffer.costs[:] = costs
     model.replay_buffer.random_cost = random_cost
     model.replay_buffer.tolerance = tolerance
@@ -87,6 +88,65 @@ def test_returns_are_short_where_each_action_matters(endless, random_cost, n):
     """What a random action costs counts in advance."""
     data = batch_of(counting_model(50), 0.15, tolerance=1.0, random_cost=random_cost)
     assert data.discounts.min() == pytest.approx(GAMMA**n)
+
+
+@pytest.mark.parametrize("change_rate, is_long", [(0.049, True), (0.051, False), (np.inf, False)])
+def test_returns_have_one_step_where_observations_change_fast(change_rate, is_long):
+    """Within the 20 steps that a return has at most."""
+    data = batch_of(counting_model(50), 0.0, change_rate=change_rate)
+    assert (data.discounts < 0.99 * GAMMA).any() == is_long
+
+
+def random_walk(rng, n, kept):
+    """:return: (n, 1) steps of an autocorrelation"""
+    walk = [rng.normal()]
+    for noise in rng.normal(size=n - 1):
+        walk.append(kept * walk[-1] + np.sqrt(1 - kept**2) * noise)
+    return np.array(walk)[:, None]
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.5, 0.95])
+def test_change_rate(kept):
+    """It does not depend on units, and leaves out what does not change."""
+    walk = random_walk(np.random.default_rng(0), 20_000, kept)
+    before, after = walk[:-1], walk[1:]
+    assert change_rate(before, after) == pytest.approx(1 - kept, rel=0.1)
+    per_episode, constant = np.repeat([[1.0], [2.0]], len(before) // 2 + 1, axis=0)[: len(before)], np.ones((len(before), 1))
+    more = np.hstack([1e4 + 1e3 * before, per_episode, constant]), np.hstack([1e4 + 1e3 * after, per_episode, constant])
+    assert change_rate(*more) == pytest.approx(change_rate(before, after))
+    assert change_rate(constant, constant) == np.inf
+
+
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "Platform-v0", "Goal-v0", "HardGoal-v0", "CatchPoint-v0", "HardMove4-v0"])
+def test_observations_of_the_benchmarks_change_fast(env_id):
+    """Those of a pendulum do not."""
+    env = gym.make(env_id)
+    env.action_space.seed(0)
+    obs, _ = env.reset(seed=0)
+    steps = []
+    for _ in range(300):
+        new_obs, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        steps.append((obs, new_obs))
+        obs = env.reset()[0] if terminated or truncated else new_obs
+    assert (change_rate(*np.array(steps).swapaxes(0, 1)) * watkins_buffer.MAX_STEPS < 1) == (env_id == "Pendulum-v1")
+
+
+def test_the_first_transitions_tell_how_fast_observations_change(monkeypatch):
+    """All of them, in parts if observations are dicts, not more than there are."""
+    monkeypatch.setattr(watkins_buffer, "N_FIRST", 60)
+    model = filled_model(GoalEnv(), policy="MultiInputPolicy", n_transitions=40)
+    buffer = model.replay_buffer
+    sample(model, 10)
+
+    def expected(n):
+        parts = [(buffer.observations[key][:n, 0], buffer.next_observations[key][:n, 0]) for key in buffer.observations]
+        return change_rate(*(np.concatenate([part[i] for part in parts], axis=1) for i in range(2)))
+
+    assert buffer.change_rate == pytest.approx(expected(40))
+    before = buffer.change_rate
+    model.learn(30, reset_num_timesteps=False)
+    sample(model, 10)
+    assert buffer.change_rate == before  # twice as many are due, and there will be 60 at most
 
 
 def test_returns_end_at_random():

@@ -55,7 +55,8 @@ class CHDP(ExploringAlgorithm):
         4. the values of next states depend on what the episode has returned so far, see :class:`ReturnNetwork`;
         5. of several actions the one that critics value most acts; while training, those that they disagree about are tried,
            see :class:`Selection`; in targets it is the next action, with a small share of a random one, :func:`next_values`;
-        6. returns in targets have several steps where actions cost little, see :class:`WatkinsReplayBuffer`;
+        6. returns in targets have several steps where observations change slowly and actions cost little, see
+           :class:`WatkinsReplayBuffer`;
         7. the discrete policy is improved by comparing a few discrete actions, each with the parameters that the continuous
            policy draws for it, see :func:`discrete_policy_loss`, and the continuous policy for uniformly random ones too;
         8. parts of actions are explored, at a rate that follows from the task, see :func:`exploration_rate`,
@@ -81,7 +82,7 @@ class CHDP(ExploringAlgorithm):
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer at a cost of more complexity.
     :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the critics. By default n
-        depends on what actions cost, see :class:`WatkinsReplayBuffer`; with ``replay_buffer_class=ReplayBuffer`` it is 1
+        depends on the task, see :class:`WatkinsReplayBuffer`; with ``replay_buffer_class=ReplayBuffer`` it is 1
     :param latent_dim: width d_e of the latent and of a codeword, at most that of one choice of a factored space
     :param n_diffusion_steps: number N of denoising steps of both policies
     :param eta: weight of the policy improvement terms relative to the diffusion losses

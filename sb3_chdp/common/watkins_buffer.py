@@ -16,6 +16,8 @@ from sb3_chdp.common.n_step_buffer import HybridNStepReplayBuffer
 DECAY, MAX_STEPS = 0.9, 20
 # Weight of a batch in the running mean of what random actions cost
 COST_RATE = 0.05
+# First transitions that tell how fast observations change, and entries of an observation at most that are looked at
+N_FIRST, MAX_ENTRIES = 1000, 512
 
 
 class WatkinsReplayBufferSamples(NamedTuple):
@@ -35,6 +37,19 @@ class WatkinsReplayBufferSamples(NamedTuple):
     next_indices: Index
 
 
+def change_rate(before: np.ndarray, after: np.ndarray) -> float:
+    """
+    How much observations change in a step: E[(s' - s)^2] / (2 var s), which is 1 - autocorrelation.
+
+    :param before: (n, n_entries) observations
+    :param after: (n, n_entries) the next ones
+    :return: mean over the entries that change, about 1 / number of steps until observations are others; infinity if none does
+    """
+    changes, variances = np.square(after - before).mean(axis=0), before.var(axis=0)
+    which = (changes > 0) & (variances > 0)
+    return float((changes[which] / (2 * variances[which])).mean()) if which.any() else np.inf
+
+
 class WatkinsReplayBuffer(HybridNStepReplayBuffer):
     """
     Replay buffer of n-step returns that end before actions which are worse than the best ones of their states.
@@ -43,6 +58,9 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
     ``tolerance`` in all. If each action decides, a random one alone costs more, and returns have one step. If an action
     matters little, as in a short time step, they have many: critics hear soon of what comes in the end. Returns end at
     random, too, with probability 1 - ``DECAY`` after each step, so that all costs are asked for again.
+
+    Critics that have hardly seen a reward do not know what actions cost. So returns have one step, too, where observations
+    become others within ``n_steps``, see :func:`change_rate`.
 
     Source: the cuts of Q(lambda) (Watkins, 1989), there at every action that is not the best, and its returns' geometric
     lengths.
@@ -56,6 +74,7 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
         last told, infinity before
     :ivar random_cost: running mean of that of random actions over states, infinity before
     :ivar tolerance: sum of costs up to which a return goes on
+    :ivar change_rate: :func:`change_rate` of the first ``N_FIRST`` transitions, infinity before there are any
     """
 
     def __init__(
@@ -66,6 +85,7 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
         self.costs = np.full((self.buffer_size, self.n_envs), np.inf, dtype=np.float32)
         self.random_cost = np.inf
         self.tolerance = 0.0
+        self.change_rate, self.n_seen = np.inf, 0
 
     def add(self, *args: Any, **kwargs: Any) -> None:
         """See :meth:`stable_baselines3.common.buffers.ReplayBuffer.add`."""
@@ -85,7 +105,20 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
             before, mean = self.random_cost, float(of_random.mean())
             self.random_cost = before + COST_RATE * (mean - before) if np.isfinite(before) else mean
 
+    def _update_change_rate(self) -> None:
+        n = min(self.size(), max(N_FIRST // self.n_envs, 1))
+        if n >= 2 * self.n_seen:  # not for every batch
+            self.n_seen = n
+            self.change_rate = change_rate(*(self._first(obs, n) for obs in (self.observations, self.next_observations)))
+
+    def _first(self, observations: np.ndarray | dict[str, np.ndarray], n: int) -> np.ndarray:
+        """:return: (n * n_envs, n_entries) entries of observations of the first n steps"""
+        parts = observations.values() if isinstance(observations, dict) else [observations]
+        entries = [part[:n].reshape(n * self.n_envs, -1) for part in parts]
+        return np.concatenate([part[:, :: 1 + part.shape[1] // MAX_ENTRIES].astype(np.float64) for part in entries], axis=1)
+
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> WatkinsReplayBufferSamples:  # type: ignore[override]
+        self._update_change_rate()
         envs = np.random.randint(0, self.n_envs, size=batch_inds.shape)
         steps = (batch_inds[:, None] + np.arange(self.n_steps)) % self.buffer_size
         index = steps, envs[:, None]
@@ -93,7 +126,7 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
         # What follows the newest transition is not its future
         ends = (self.dones[index] + self.timeouts[index] > 0) | (steps == (self.pos - 1) % self.buffer_size)
         costs = self.random_cost + np.cumsum(self.costs[index][:, 1:], axis=1)
-        goes_on = ~ends[:, :-1] & (costs <= self.tolerance)
+        goes_on = ~ends[:, :-1] & (costs <= self.tolerance) & (self.n_steps * self.change_rate < 1)
         goes_on &= np.random.random(goes_on.shape) < DECAY
         n = 1 + np.logical_and.accumulate(goes_on, axis=1).sum(axis=1)
         rewards = self._normalize_reward(self.rewards[index], env)
