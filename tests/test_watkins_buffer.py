@@ -131,22 +131,24 @@ def test_observations_of_the_benchmarks_change_fast(env_id):
     assert (change_rate(*np.array(steps).swapaxes(0, 1)) * watkins_buffer.MAX_STEPS < 1) == (env_id == "Pendulum-v1")
 
 
-def test_the_first_transitions_tell_how_fast_observations_change(monkeypatch):
-    """All of them, in parts if observations are dicts, not more than there are."""
+@pytest.mark.parametrize("max_entries, stride", [(512, 1), (1, 3)])
+def test_the_first_transitions_tell_how_fast_observations_change(monkeypatch, max_entries, stride):
+    """As many as there are and count, in parts if observations are dicts, of long ones some entries."""
     monkeypatch.setattr(watkins_buffer, "N_FIRST", 60)
-    model = filled_model(GoalEnv(), policy="MultiInputPolicy", n_transitions=40)
+    monkeypatch.setattr(watkins_buffer, "MAX_ENTRIES", max_entries)
+    model = filled_model(GoalEnv(), policy="MultiInputPolicy", n_transitions=20)
     buffer = model.replay_buffer
-    sample(model, 10)
 
     def expected(n):
-        parts = [(buffer.observations[key][:n, 0], buffer.next_observations[key][:n, 0]) for key in buffer.observations]
-        return change_rate(*(np.concatenate([part[i] for part in parts], axis=1) for i in range(2)))
+        stored = buffer.observations, buffer.next_observations
+        return change_rate(*(np.hstack([part[:n, 0, ::stride] for part in parts.values()]) for parts in stored))
 
-    assert buffer.change_rate == pytest.approx(expected(40))
-    before = buffer.change_rate
-    model.learn(30, reset_num_timesteps=False)
     sample(model, 10)
-    assert buffer.change_rate == before  # twice as many are due, and there will be 60 at most
+    assert buffer.change_rate == pytest.approx(expected(20))
+    model.learn(100, reset_num_timesteps=False)
+    sample(model, 10)
+    assert buffer.change_rate == pytest.approx(expected(60))
+    assert len({expected(20), expected(60), expected(120)}) == 3
 
 
 def test_returns_end_at_random():

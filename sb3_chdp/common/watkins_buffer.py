@@ -75,6 +75,7 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
     :ivar random_cost: running mean of that of random actions over states, infinity before
     :ivar tolerance: sum of costs up to which a return goes on
     :ivar change_rate: :func:`change_rate` of the first ``N_FIRST`` transitions, infinity before there are any
+    :ivar n_seen: number of steps that it was taken from
     """
 
     def __init__(
@@ -107,7 +108,8 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
 
     def _update_change_rate(self) -> None:
         n = min(self.size(), max(N_FIRST // self.n_envs, 1))
-        if n >= 2 * self.n_seen:  # not for every batch
+        # Not for every batch
+        if n >= 2 * self.n_seen:
             self.n_seen = n
             self.change_rate = change_rate(*(self._first(obs, n) for obs in (self.observations, self.next_observations)))
 
