@@ -6,7 +6,7 @@ import torch as th
 
 from sb3_chdp import CHDP
 from sb3_chdp.chdp import PaperCHDP
-from sb3_chdp.chdp.value_scale import MIN_UPDATE_WEIGHT, ValueScale
+from sb3_chdp.chdp.value_scale import LARGEST_LOSS, MIN_UPDATE_WEIGHT, ValueScale, bounded_mean
 from tests.algorithms import filled_model, sample
 from tests.hybrid_envs import HybridIdentityEnv
 
@@ -25,6 +25,80 @@ def test_outputs_have_zero_mean_and_values_unit_variance(spread):
     assert outputs.mean(dim=(0, 1)).abs().max() < 0.1
     values = value_scale.values(outputs[..., :1]).float()
     th.testing.assert_close(values, targets[..., :1], rtol=1e-4, atol=1e-4 * spread)
+
+
+def test_rare_disasters_do_not_hide_other_differences():
+    value_scale, generator = ValueScale(), th.Generator().manual_seed(0)
+    targets = 5 * th.randn(600, 64, 2, generator=generator) - 30
+    disasters = th.rand(600, 64, generator=generator) < 1e-3
+    targets[disasters] = -1e6
+    value_scale.start(targets[:2].flatten(0, 1)[:, :1], th.zeros(128, 1))
+    assert -32 < value_scale.center[0] < -28
+    for batch in targets:
+        value_scale.update(batch)
+    assert 5 <= value_scale.scale <= 11
+    assert value_scale.center.tolist() == pytest.approx([-30, -30], abs=1)
+    outputs = value_scale.outputs(targets[300:])
+    assert (outputs[disasters[300:]] == -LARGEST_LOSS).all()
+    assert 0.4 < outputs[~disasters[300:]].std() < 1.1
+
+
+@pytest.mark.parametrize("share", [0.2, 0.02, 0.002])
+def test_rare_successes_count_in_full(share):
+    value_scale = ValueScale()
+    targets = th.zeros(1000, 2)
+    targets[: round(1000 * share)] = 50.0
+    for _ in range(3):
+        value_scale.update(targets)
+    assert value_scale.scale.item() == pytest.approx(targets[:, 0].std(correction=0).item(), rel=0.01)
+    outputs = value_scale.outputs(targets)[:, :1]
+    th.testing.assert_close(value_scale.values(outputs).float(), targets[:, :1], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(("fall_of_batch", "fall"), [(0.5, 0.0), (0.0, 100.0)])
+def test_values_that_fall_are_no_disasters(fall_of_batch, fall):
+    """Neither slowly, nor all at once."""
+    value_scale, generator = ValueScale(), th.Generator().manual_seed(0)
+    targets = th.randn(2000, 64, 2, generator=generator) - fall_of_batch * th.arange(2000)[:, None, None]
+    targets[1000:] -= fall
+    for batch in targets:
+        value_scale.update(batch)
+    outputs = value_scale.outputs(targets[-1])
+    assert outputs.min() > -LARGEST_LOSS
+    assert outputs.mean().abs() < 3
+    assert value_scale.scale == value_scale.variance.sqrt()
+
+
+def test_bounded_mean():
+    x = th.arange(100.0)[:, None]
+    assert bounded_mean(x).item() == pytest.approx(49.5)
+    x[0] = -1e9
+    assert -60 < bounded_mean(x).item() < 50
+    # Nothing lies above the median: there is no unit to bound with
+    assert bounded_mean(th.tensor([[0.0], [0.0], [-3.0]])).item() == pytest.approx(-1)
+
+
+class Disasters(HybridIdentityEnv):
+    """One of 200 rewards is a disaster, whatever the action."""
+
+    n_steps = 0
+
+    def step(self, action):
+        obs, reward, *end = super().step(action)
+        self.n_steps += 1
+        return obs, reward - 1e6 * (self.n_steps % 200 == 0), *end
+
+
+def test_learns_in_spite_of_rare_disasters():
+    model = filled_model(Disasters(), n_transitions=400)
+    model.train(400, 32)
+    env = HybridIdentityEnv()
+    obs, rewards = env.reset(seed=1)[0], []
+    for _ in range(200):
+        obs, reward, *_ = env.step(model.predict(obs, deterministic=True)[0])
+        rewards.append(reward)
+    # 0.09 by chance
+    assert np.mean(rewards) > 0.35
 
 
 def test_what_untrained_critics_put_out_is_no_value():
