@@ -150,7 +150,8 @@ def test_ends_of_episodes():
         for layer in (network.value[-1], network.advantage[-1]):
             for parameter in layer.parameters():
                 parameter.zero_()
-    model.policy.value_scale.variance += 4 - model.policy.value_scale.variance
+    for variance in (model.policy.value_scale.variance, model.policy.value_scale.upper_variance):
+        variance.fill_(4.0)
     model.policy.value_scale.center[0] = 2.0
     claims = Claims(np.empty((3, 0)), np.arange(3), np.zeros(3), np.array([1.0, 10.0, 100.0]), np.array([0.5, 0.5, 0.5]))
     infos = [{}, {}, {"TimeLimit.truncated": True}]
