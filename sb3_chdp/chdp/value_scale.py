@@ -15,6 +15,8 @@ LARGEST_LOSS, LARGEST_RATIO = 10.0, 2.0
 
 def bounded_mean(x: th.Tensor) -> th.Tensor:
     """
+    A mean that few numbers far below the others do not decide.
+
     :param x: (n, m) numbers
     :return: (m,) means, in which no number lies further below the median than ``LARGEST_LOSS`` times the standard deviation of
         those above it
@@ -32,7 +34,7 @@ class ValueScale(nn.Module):
     van Hasselt et al., 2016). At first all values are the same, see :meth:`start`, whatever the critics put out.
 
     Where a few values are far worse than all others, neither follows them: the scale is at most ``LARGEST_RATIO`` times the
-    standard deviation of the values above the center, and what is worse than ``LARGEST_LOSS`` counts as that.
+    standard deviation of the values above the center, and what lies more than ``LARGEST_LOSS`` scales below it counts as so many.
 
     :param adapts: False: values are what the critics put out, for ever
     """
