@@ -34,7 +34,8 @@ class ValueScale(nn.Module):
     van Hasselt et al., 2016). At first all values are the same, see :meth:`start`, whatever the critics put out.
 
     Where a few values are far worse than all others, neither follows them: the scale is at most ``LARGEST_RATIO`` times the
-    standard deviation of the values above the center, and what lies more than ``LARGEST_LOSS`` scales below it counts as so many.
+    standard deviation of the values above the center, and what lies more than ``LARGEST_LOSS`` scales below the center counts
+    as so many.
 
     :param adapts: False: values are what the critics put out, for ever
     """
