@@ -293,7 +293,7 @@ def test_next_values_are_whole_without_foresight():
     th.testing.assert_close(targets[:, :1], data.rewards + 0.9 * policy.value_scale.values(q_values))
 
 
-def test_costs_of_stored_actions():
+def test_costs_of_stored_and_of_random_actions():
     """By how much the critics value them less than the best action."""
     model = filled_model()
     data, policy = sample(model), model.policy
@@ -301,12 +301,12 @@ def test_costs_of_stored_actions():
     features = critic.features(data.next_observations)
     calls = calls_of(critic.q_networks[0])
     _, costs = losses.next_values(policy, data.next_observations, stored=data.actions)
-    best, of_stored, _ = [args[1:] for args in calls]
+    best, of_random, of_stored = [args[1:] for args in calls]
     assert th.equal(of_stored[0], codebook.representative_latents(data.discrete_actions))
     assert th.equal(of_stored[1], data.parameters)
     with th.no_grad():
-        q, q_stored = (th.min(*critic.q_values(features, *action)) for action in (best, of_stored))
-    th.testing.assert_close(costs, q - q_stored)
+        q, q_random, q_stored = (th.min(*critic.q_values(features, *action)) for action in (best, of_random, of_stored))
+    th.testing.assert_close(costs, th.cat([q - q_stored, q - q_random], dim=1))
 
 
 def test_next_actions_obey_masks():
