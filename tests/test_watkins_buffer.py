@@ -44,10 +44,11 @@ def endless(monkeypatch):
     monkeypatch.setattr(watkins_buffer, "DECAY", 1.0)
 
 
-def batch_of(model, costs, tolerance=0.0, n=400, change_rate=0.0):
-    """:return: a batch if all stored actions have the given costs, and observations change so fast"""
+def batch_of(model, costs, tolerance=0.0, n=400, random_cost=0.0, change_rate=0.0):
+    """:return: a batch if all stored actions have the given costs, random ones on average, and observations change so fast"""
     model.replay_buffer.change_rate, model.replay_buffer.n_seen = change_rate, np.inf
     model.replay_buffer.costs[:] = costs
+    model.replay_buffer.random_cost = random_cost
     model.replay_buffer.tolerance = tolerance
     return sample(model, n)
 
@@ -80,6 +81,13 @@ def test_returns_end_before_what_costs_too_much(endless, cost, n):
     data = batch_of(counting_model(50), cost, tolerance=1.0)
     assert data.discounts.min() == pytest.approx(GAMMA**n)
     assert (data.discounts == data.discounts.min()).float().mean() > 0.8
+
+
+@pytest.mark.parametrize("random_cost, n", [(0.9, 1), (0.8, 2), (0.6, 3), (0.5, 4)])
+def test_returns_are_short_where_each_action_matters(endless, random_cost, n):
+    """What a random action costs counts in advance."""
+    data = batch_of(counting_model(50), 0.15, tolerance=1.0, random_cost=random_cost)
+    assert data.discounts.min() == pytest.approx(GAMMA**n)
 
 
 @pytest.mark.parametrize("change_rate, is_long", [(0.049, True), (0.051, False), (np.inf, False)])
@@ -166,9 +174,18 @@ def test_costs_are_those_of_the_actions_that_followed(n_envs):
     data = sample(model, 60)
     times, envs = data.next_indices
     np.testing.assert_array_equal(data.next_actions, buffer.actions[times, envs])
-    buffer.update_costs(data.next_indices, th.arange(60.0)[:, None] - 1)
+    goes_on = th.zeros(60, 1)
+    buffer.update_costs(data.next_indices, th.stack([th.arange(60.0) - 1, th.full((60,), 2.0)], dim=1), goes_on)
     assert buffer.costs[times[-1], envs[-1]] == 58 and buffer.costs.min() >= 0
     assert np.isinf(buffer.costs).any()
+    # A running mean
+    assert buffer.random_cost == 2
+    buffer.update_costs(data.next_indices, th.full((60, 2), 4.0), goes_on)
+    assert buffer.random_cost == pytest.approx(2 + 2 * watkins_buffer.COST_RATE)
+    # Nothing follows the end of an episode
+    before = buffer.random_cost
+    buffer.update_costs(data.next_indices, th.full((60, 2), 9.0), 1 - goes_on)
+    assert buffer.random_cost == before
 
     model.train(30, 64)
     assert np.isfinite(buffer.costs[1 : buffer.pos]).mean() > 0.9
@@ -234,9 +251,9 @@ def test_dict_observations():
         np.testing.assert_array_equal(part, buffer.next_observations[key][times - 1, envs])
         stored = buffer.observations[key][: buffer.pos, 0]
         assert all((stored == obs.numpy()).all(axis=1).any() for obs in data.observations[key])
-    buffer.costs[:] = np.inf
+    buffer.costs[:] = buffer.random_cost = np.inf
     model.train(5, 16)
-    assert np.isfinite(buffer.costs).any()
+    assert np.isfinite(buffer.costs).any() and np.isfinite(buffer.random_cost)
 
 
 def test_saved_costs(tmp_path):
@@ -245,3 +262,4 @@ def test_saved_costs(tmp_path):
     other = CHDP("MlpPolicy", HybridIdentityEnv())
     other.load_replay_buffer(tmp_path / "buffer")
     np.testing.assert_array_equal(other.replay_buffer.costs, model.replay_buffer.costs)
+    assert other.replay_buffer.random_cost == model.replay_buffer.random_cost > 0

@@ -29,8 +29,8 @@ from sb3_chdp.common.watkins_buffer import WatkinsDictReplayBuffer, WatkinsRepla
 
 # High at first, and 0 in the end: what is learnt settles
 LEARNING_RATE = LinearSchedule(1e-3, 0.0, 1.0)
-# What the actions on the way of an n-step return may cost, in the critics' units, with full foresight
-LARGEST_COST = 0.1
+# What actions on the way of an n-step return and a random one may cost, in the critics' units, with full foresight
+LARGEST_COST = 0.2
 
 
 class CHDP(ExploringAlgorithm):
@@ -233,7 +233,7 @@ class CHDP(ExploringAlgorithm):
             targets = policy.in_units_of_critics(targets)
             if isinstance(self.replay_buffer, WatkinsReplayBuffer):
                 assert replay_data.next_indices is not None and costs is not None, "such a buffer says what follows"
-                self.replay_buffer.update_costs(replay_data.next_indices, costs)
+                self.replay_buffer.update_costs(replay_data.next_indices, costs, replay_data.dones)
             features = policy.critic.features(replay_data.observations)
             self.update_targets.copy_statistics()
             loss, q1, errors = critic_loss(policy, replay_data, features, targets[:, :1])

@@ -32,8 +32,8 @@ def next_values(
     :param masks: (B, K) False for discrete actions that may not be taken, None if all may
     :param returns: (B, 1) what episodes have returned, which the policies do not know; None: not known at all
     :param stored: (B, columns) rows of other actions
-    :return: (B, 1) values in the units of the rewards, with all that follows, and in those of the critics (B, 1) by how much
-        stored actions are worth less than the best ones, None without stored ones
+    :return: (B, 1) values in the units of the rewards, with all that follows, and in those of the critics (B, 2) by how much
+        stored and random actions are worth less than the best ones, None without stored ones
     """
     critic, actor = policy.critic_target, policy.actor_target
     features = critic.features(observations)
@@ -46,13 +46,15 @@ def next_values(
 
     latents, _, parameters = policy.select_target(actor, policy.choosing_critic, features, masks=masks)
     values, costs = values_of(latents, parameters), None
-    if stored is not None:
-        columns = policy.action_space.columns
-        latents = actor.codebook.representative_latents(columns.discrete_actions(stored))
-        costs = values - values_of(latents, columns.view(stored, "parameters"))
-    if policy.random_share > 0:
+    if policy.random_share > 0 or stored is not None:
         latents, _, parameters = actor.random_actions(len(features), masks=masks)
-        values = values.lerp(values_of(latents, parameters), policy.random_share)
+        of_random = values_of(latents, parameters)
+        if stored is not None:
+            columns = policy.action_space.columns
+            latents = actor.codebook.representative_latents(columns.discrete_actions(stored))
+            of_stored = values_of(latents, columns.view(stored, "parameters"))
+            costs = th.cat([values - of_stored, values - of_random], dim=1)
+        values = values.lerp(of_random, policy.random_share)
     return policy.value_scale.values(values), costs
 
 
@@ -64,8 +66,8 @@ def target_values(policy: CHDPPolicy, replay_data: HybridReplaySamples) -> tuple
 
     :param policy: the networks
     :param replay_data: a batch
-    :return: (B, 2) values and rewards, in the units of the rewards, and (B, 1) what the actions cost that were taken in the
-        next states, None if not known
+    :return: (B, 2) values and rewards, in the units of the rewards, and (B, 2) what the actions cost that were taken in the
+        next states, and random ones, None if not known
     """
     values, costs = next_values(
         policy, replay_data.next_observations, replay_data.next_masks, replay_data.next_returns, replay_data.next_actions

@@ -14,6 +14,8 @@ from sb3_chdp.common.n_step_buffer import HybridNStepReplayBuffer
 
 # Probability that a return goes on after a step, and most steps that one has
 DECAY, MAX_STEPS = 0.9, 20
+# Weight of a batch in the running mean of what random actions cost
+COST_RATE = 0.05
 # First transitions that tell how fast observations change, and entries of an observation at most that are looked at
 N_FIRST, MAX_ENTRIES = 1000, 512
 
@@ -52,10 +54,10 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
     """
     Replay buffer of n-step returns that end before actions which are worse than the best ones of their states.
 
-    A return goes on for as long as these actions cost no more than ``tolerance`` in all. If each action decides, it ends
-    before the first that is not among the best. If an action matters little, as in a short time step, it has many steps:
-    critics hear soon of what comes in the end. Returns end at random, too, with probability 1 - ``DECAY`` after each step, so
-    that all costs are asked for again.
+    A return goes on for as long as these actions, and a random one in the mean over all states, cost no more than
+    ``tolerance`` in all. If each action decides, a random one alone costs more, and returns have one step. If an action
+    matters little, as in a short time step, they have many: critics hear soon of what comes in the end. Returns end at
+    random, too, with probability 1 - ``DECAY`` after each step, so that all costs are asked for again.
 
     Critics that have hardly seen a reward do not know what actions cost. So returns have one step, too, where observations
     become others within ``n_steps``, see :func:`change_rate`.
@@ -70,6 +72,7 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
 
     :ivar costs: (buffer_size, n_envs) by how much the actions were worth less than the best ones when :meth:`update_costs` was
         last told, infinity before
+    :ivar random_cost: running mean of that of random actions over states, infinity before
     :ivar tolerance: sum of costs up to which a return goes on
     :ivar change_rate: :func:`change_rate` of the first ``N_FIRST`` transitions, infinity before there are any
     :ivar n_seen: number of steps that it was taken from
@@ -81,6 +84,7 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
         check_takes(self, observation_space, "WatkinsDictReplayBuffer")
         super().__init__(buffer_size, observation_space, *args, n_steps=n_steps, **kwargs)
         self.costs = np.full((self.buffer_size, self.n_envs), np.inf, dtype=np.float32)
+        self.random_cost = np.inf
         self.tolerance = 0.0
         self.change_rate, self.n_seen = np.inf, 0
 
@@ -89,12 +93,18 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
         self.costs[self.pos] = np.inf
         super().add(*args, **kwargs)
 
-    def update_costs(self, indices: Index, costs: th.Tensor) -> None:
+    def update_costs(self, indices: Index, costs: th.Tensor, dones: th.Tensor) -> None:
         """
         :param indices: ``next_indices`` of a batch. Those behind the end of an episode or of the data count for nothing
-        :param costs: (B, 1) by how much its ``next_actions`` are worth less than the best ones; below 0 is 0
+        :param costs: (B, 2) by how much its ``next_actions`` and random ones are worth less than the best ones; below 0 is 0
+        :param dones: (B, 1) its dones: where the episode has ended critics learn no values
         """
-        self.costs[indices] = costs[:, 0].clamp(min=0).cpu().numpy()
+        of_stored, of_random = costs.clamp(min=0).cpu().numpy().T
+        self.costs[indices] = of_stored
+        of_random = of_random[dones[:, 0].cpu().numpy() == 0]
+        if len(of_random) > 0:
+            before, mean = self.random_cost, float(of_random.mean())
+            self.random_cost = before + COST_RATE * (mean - before) if np.isfinite(before) else mean
 
     def _update_change_rate(self) -> None:
         n = min(self.size(), max(N_FIRST // self.n_envs, 1))
@@ -117,7 +127,7 @@ class WatkinsReplayBuffer(HybridNStepReplayBuffer):
 
         # What follows the newest transition is not its future
         ends = (self.dones[index] + self.timeouts[index] > 0) | (steps == (self.pos - 1) % self.buffer_size)
-        costs = np.cumsum(self.costs[index][:, 1:], axis=1)
+        costs = self.random_cost + np.cumsum(self.costs[index][:, 1:], axis=1)
         goes_on = ~ends[:, :-1] & (costs <= self.tolerance) & (self.n_steps * self.change_rate < 1)
         goes_on &= np.random.random(goes_on.shape) < DECAY
         n = 1 + np.logical_and.accumulate(goes_on, axis=1).sum(axis=1)
