@@ -22,7 +22,7 @@ def layouts() -> dict[str, spaces.Space]:
         "flat": spaces.Tuple((spaces.Discrete(3), box(-2, 3, 1), box(-1, 1, 2), box(0, 1, 1))),
         "shared": spaces.Tuple((spaces.Discrete(3), box(-4, 4, 2))),
         "dict": spaces.Dict({"kind": spaces.Discrete(3), "values": spaces.Tuple((box(0, 1, 1), box(0, 2, 1), box(0, 3, 2)))}),
-        "one_of": spaces.OneOf((box(-1, 1, 1), box(0, 1, 2), box(5, 6, 1))),
+        "one_of": spaces.OneOf((box(0, 1, 2), spaces.Tuple((spaces.Discrete(2), box(5, 6, 1))))),
         "product": spaces.Dict({"a": spaces.MultiDiscrete([2, 2]), "b": spaces.MultiBinary(1), "x": box(-1, 1, 2)}),
     }
 

@@ -48,15 +48,20 @@ def hybrid_spaces(draw):
     if layout == "dict_flat":
         return spaces.Dict({"which": discrete, **{f"p{i}": option for i, option in enumerate(options)}})
     if layout == "one_of":
-        return spaces.OneOf(options)
+        parts = [
+            [],
+            [spaces.Discrete(2, start=-1)],
+            [spaces.Dict({"m": spaces.MultiBinary(2), "n": spaces.MultiDiscrete([1, 2])})],
+        ]
+        return spaces.OneOf([spaces.Tuple((option, *draw(st.sampled_from(parts)))) for option in options])
     others = [spaces.MultiDiscrete([2, 3]), spaces.MultiBinary((2, 1)), spaces.MultiDiscrete(np.array([[2], [1]]))]
     return spaces.Tuple((discrete, draw(st.sampled_from(others)), spaces.Dict({"x": options[0], "y": box(-1, 1, 2)})))
 
 
-def executed_boxes(space, is_shared, k):
+def executed_boxes(space, is_shared, k, native):
     """:return: (path in a native action, box) of the parameters of action k, which are what a row must keep"""
     if isinstance(space, spaces.OneOf):
-        leaves = leaves_of(space.spaces[k], (1,))
+        leaves = leaves_of(space.spaces[native[0]], (1,))
     elif is_shared:
         leaves = leaves_of(space)
     else:
@@ -89,7 +94,7 @@ def test_native_actions_are_in_the_space_and_round_trip(space, seed):
         assert space.contains(native)
         assert not row[1:][~spec.parameter_mask[k]].any()
         np.testing.assert_equal(spec.to_row(native)[0], k)
-        for path, leaf in executed_boxes(space, spec.is_shared, k):
+        for path, leaf in executed_boxes(space, spec.is_shared, k, native):
             width = float(np.max(leaf.high.astype(float) - leaf.low.astype(float), initial=0.0))
             before, after = get_part(sample, path), get_part(native, path)
             np.testing.assert_allclose(after, before, rtol=0, atol=4e-16 * max(width, 1000))
@@ -124,6 +129,20 @@ def test_tables():
     assert spec.parameter_index.tolist() == [[0, 1], [2, 0], [0, 0]]
     k, parameters = spec.to_native([1, 0.5, 0.9])
     assert k == 1 and parameters[1] == pytest.approx(3.75)
+
+
+def test_parts_of_a_one_of_may_have_discrete_values():
+    jump = spaces.Dict({"x": box(0, 1, 2), "legs": spaces.MultiBinary(2)})
+    spec = HybridActionSpec(spaces.OneOf((spaces.Discrete(2, start=5), jump, box(-1, 1, 1))))
+    assert spec.parameter_mask.sum(axis=1).tolist() == [0, 0, 2, 2, 2, 2, 1]
+    natives = [spec.to_native([k, 0, 0]) for k in range(7)]
+    assert [int(part) for part, _ in natives] == [0, 0, 1, 1, 1, 1, 2]
+    assert [action for _, action in natives[:2]] == [5, 6]
+    assert [action["legs"].tolist() for _, action in natives[2:6]] == [[0, 0], [0, 1], [1, 0], [1, 1]]
+    assert [spec.to_row(native)[0] for native in natives] == list(range(7))
+    for wrong in ((3, np.zeros(1)), (-1, np.zeros(1)), (0, 4)):
+        with pytest.raises(ValueError, match="action must be in"):
+            spec.to_row(wrong)
 
 
 @pytest.mark.parametrize("layout", layouts())
@@ -168,7 +187,9 @@ def test_ambiguous_space_and_override():
         (spaces.Tuple((spaces.Discrete(2), box(0, 1, 0))), "no continuous part"),
         (spaces.Tuple((spaces.Discrete(2), spaces.Text(3))), "Text"),
         (spaces.Tuple((spaces.Discrete(131_072), box(0, 1, 1))), "131072 joint discrete actions"),
-        (spaces.OneOf((box(0, 1, 1), spaces.Discrete(3))), "OneOf"),
+        (spaces.OneOf((box(0, 1, 1), spaces.Text(3))), r"action_space.spaces\[1\] is a Text"),
+        (spaces.OneOf((spaces.Discrete(2), spaces.Discrete(3))), "no continuous part"),
+        (spaces.OneOf((box(0, 1, 1), spaces.MultiBinary(40))), "1099511627777 discrete actions"),
         (spaces.Discrete(3), "Tuple, Dict or OneOf"),
     ],
 )

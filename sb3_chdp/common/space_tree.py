@@ -26,6 +26,17 @@ class DiscreteLeaf(NamedTuple):
     radices: tuple[int, ...]
     start: np.ndarray
 
+    def value_of(self, digits: np.ndarray) -> Any:
+        """:return: the native value of digits that count from 0"""
+        values = digits + self.start
+        if isinstance(self.space, spaces.Discrete):
+            return self.space.dtype.type(values[0])
+        return values.reshape(self.space.shape).astype(self.space.dtype)
+
+    def digits_of(self, value: Any) -> np.ndarray:
+        """Inverse of :meth:`value_of`."""
+        return (np.ravel(value) - self.start).astype(np.int64)
+
 
 def children_of(space: spaces.Space[Any]) -> list[tuple[Any, spaces.Space[Any]]] | None:
     """:return: (key, child) pairs of a ``Tuple`` or ``Dict``, None for a leaf."""
@@ -105,24 +116,21 @@ def find_options(space: spaces.Space[Any]) -> tuple[Path, list[tuple[Path, space
     return None
 
 
-def collect_discrete(space: spaces.Space[Any]) -> list[DiscreteLeaf]:
+def discrete_leaves(space: spaces.Space[Any], name: str = "action_space") -> Iterator[DiscreteLeaf]:
     """
-    :param space: an action space whose boxes serve all actions
+    :param space: an action space, or a part of one
+    :param name: what to call it in messages
     :return: its discrete leaves
-    :raises ValueError: if there is none, or a leaf is neither discrete nor a box
+    :raises ValueError: if a leaf is neither discrete nor a box
     """
-    leaves = []
     for path, leaf in leaves_of(space):
         if isinstance(leaf, (spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)):
-            leaves.append(DiscreteLeaf(path, leaf, *digits_of(leaf)))
+            yield DiscreteLeaf(path, leaf, *digits_of(leaf))
         elif not isinstance(leaf, spaces.Box):
             raise ValueError(
-                f"{name_of(path)} is a {type(leaf).__name__}; a hybrid action is made of Discrete, MultiDiscrete, "
-                "MultiBinary and Box parts, or is a OneOf of Box parts as a whole"
+                f"{name_of(path, name)} is a {type(leaf).__name__}; a hybrid action is made of Discrete, MultiDiscrete, "
+                "MultiBinary and Box parts, or is a OneOf of such parts as a whole"
             )
-    if not leaves:
-        raise ValueError(f"{space} has no discrete part: as one Box SB3's SAC takes it")
-    return leaves
 
 
 def collect_boxes(space: spaces.Space[Any], prefix: Path, name: str | None = None) -> list[BoxLeaf]:

@@ -12,17 +12,17 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_chdp.common.arguments import check, one_of
+from sb3_chdp.common.one_of import OneOfChoices
 from sb3_chdp.common.rows import Array, RowLayout, in_order, value_groups
 from sb3_chdp.common.space_tree import (
     DiscreteLeaf,
     Path,
     cast_to_box,
     collect_boxes,
-    collect_discrete,
     digits_of,
+    discrete_leaves,
     find_options,
     get_part,
-    is_parameter_space,
     name_of,
     replace_part,
     template_action,
@@ -45,7 +45,7 @@ class HybridActionSpec:
 
     * one box per action: ``Tuple(Discrete(K), Tuple(Box_1, ..., Box_K))``, ``Tuple(Discrete(K), Box_1, ..., Box_K)``,
       ``OneOf((Box_1, ..., Box_K))``. An action without parameters is an empty ``Box``, ``Tuple`` or ``Dict``, or
-      ``Discrete(1)``;
+      ``Discrete(1)``. A part of a ``OneOf`` may have discrete leaves, of which every combination is an action;
     * parameters shared by all actions: ``Tuple(Discrete(K), Box)``, and every product of several ``Discrete``,
       ``MultiDiscrete`` or ``MultiBinary`` leaves with ``Box`` leaves. Up to 64 combinations the discrete leaves form one
       joint index (mixed radix, first leaf most significant). Beyond that the space is factored: every digit of a leaf is a
@@ -65,30 +65,32 @@ class HybridActionSpec:
         check(one_of(LAYOUTS), action_layout=layout)
         self.space = space
         self.layout = layout
-        self._is_one_of = isinstance(space, spaces.OneOf)
+        self._one_of: OneOfChoices | None = None
         if isinstance(space, spaces.OneOf):
             if layout not in ("auto", "per_action"):
                 raise ValueError(f"action_layout={layout!r} does not apply to a OneOf space, whose parts exclude each other")
-            for i, option in enumerate(space.spaces):
-                if not is_parameter_space(option):
-                    raise ValueError(
-                        f"action_space.spaces[{i}] of a OneOf must hold Box spaces only, or be Discrete(1) for no "
-                        f"parameters, got {option}"
-                    )
+            self._one_of = OneOfChoices(space.spaces, MAX_DISCRETE_ACTIONS)
             # Read as one box per action; of its native actions only the chosen part is handed out
-            space = spaces.Tuple((spaces.Discrete(len(space.spaces)), spaces.Tuple(space.spaces)))
+            parts = [space.spaces[i] for i in self._one_of.parts]
+            space = spaces.Tuple((spaces.Discrete(len(parts)), spaces.Tuple(parts)))
         elif not isinstance(space, (spaces.Tuple, spaces.Dict)):
             raise ValueError(
                 f"The action space must be a Tuple, Dict or OneOf with a discrete and a continuous part, got {space}"
             )
-        choice = find_options(space) if layout in ("auto", "per_action") else None
+        choice: tuple[Path, list[tuple[Path, spaces.Space[Any]]]] | None = None
+        if self._one_of is not None:
+            choice = (0,), [((1, k), part) for k, part in enumerate(parts)]
+        elif layout in ("auto", "per_action"):
+            choice = find_options(space)
         if choice is None and layout == "per_action":
             raise ValueError(
                 f"action_layout='per_action' needs a Discrete(K) and exactly K parameter spaces at the top, got {space}"
             )
         self.is_shared = choice is None
         if choice is None:
-            self._discrete_leaves = collect_discrete(space)
+            self._discrete_leaves = list(discrete_leaves(space))
+            if not self._discrete_leaves:
+                raise ValueError(f"{space} has no discrete part: as one Box SB3's SAC takes it")
             options: list[tuple[Path, spaces.Space[Any]]] = [((), space)]
         else:
             discrete_path, options = choice
@@ -114,7 +116,8 @@ class HybridActionSpec:
         self.n_discrete_actions = n_joint
         #: numbers of values of the choices that a row makes: a single one, K, unless the space is factored
         self.radices: tuple[int, ...] = self.digits if self.is_factored else (n_joint,)
-        names = [f"action_space.spaces[{i}]" if self._is_one_of else None for i in range(len(options))]
+        parts_of_options = [None] * len(options) if self._one_of is None else self._one_of.parts
+        names = [None if i is None else f"action_space.spaces[{i}]" for i in parts_of_options]
         self._boxes = [collect_boxes(part, path, name) for (path, part), name in zip(options, names, strict=True)]
         self._template = self._make_template(0.0)
         self._build_tables()
@@ -234,10 +237,10 @@ class HybridActionSpec:
         native = pickle.loads(self._template)
         for box in self._boxes[option]:
             native = replace_part(native, box.path, cast_to_box(values[box.columns], box.space))
-        if self._is_one_of:
-            return np.int64(k), native[1][option]
+        if self._one_of is not None:
+            return self._one_of.native(option, native[1][option])
         for leaf, digits in zip(self._discrete_leaves, self._split_index(k), strict=True):
-            native = replace_part(native, leaf.path, self._native_digits(leaf, digits))
+            native = replace_part(native, leaf.path, leaf.value_of(digits))
         return native
 
     def _split_index(self, k: Any) -> Iterator[np.ndarray]:
@@ -249,13 +252,6 @@ class HybridActionSpec:
         for leaf in self._discrete_leaves:
             yield digits[offset : offset + len(leaf.radices)]
             offset += len(leaf.radices)
-
-    @staticmethod
-    def _native_digits(leaf: DiscreteLeaf, digits: np.ndarray) -> Any:
-        values = digits + leaf.start
-        if isinstance(leaf.space, spaces.Discrete):
-            return leaf.space.dtype.type(values[0])
-        return values.reshape(leaf.space.shape).astype(leaf.space.dtype)
 
     def names_of(self, k: int) -> str:
         """:return: the boxes of a discrete action"""
@@ -270,10 +266,10 @@ class HybridActionSpec:
         :raises ValueError: for a discrete value or a parameter outside of its range
         """
         given = action
-        if self._is_one_of:
-            action = (action[0], {int(action[0]): action[1]})
-        k = np.concatenate([np.ravel(get_part(action, leaf.path)) - leaf.start for leaf in self._discrete_leaves])
-        k = k.astype(np.int64)
+        if self._one_of is not None:
+            index = self._one_of.index_of(action)
+            action = (index, {index: action[1]})
+        k = np.concatenate([leaf.digits_of(get_part(action, leaf.path)) for leaf in self._discrete_leaves])
         if not ((k >= 0) & (k < self.digits)).all():
             raise ValueError(f"action must be in {self.space}, got {given!r}")
         if not self.is_factored:
