@@ -220,6 +220,20 @@ WARNINGS = {
         ),
         "have an effect. If every action has all of them, give the algorithm, and this function, action_layout='shared'.",
     ),
+    "a_number_each": (
+        lambda: walk(
+            action_space=spaces.Tuple((spaces.Discrete(2), PLANE)), reward=lambda self, action: float(action[1][action[0]])
+        ),
+        "action_space[1][0] with action 0, action_space[1][1] with action 1, and so on: give the algorithm, and this function, "
+        "action_layout='per_action'",
+    ),
+    "rows_for_all": (
+        lambda: walk(
+            action_space=spaces.Tuple((spaces.Discrete(2), box(-1, 1, 2, 3))),
+            reward=lambda self, action: float(action[1].sum()),
+        ),
+        "have an effect. If every action has all of them, give the algorithm, and this function, action_layout='shared'.",
+    ),
     "sorted_keys": (
         lambda: walk(
             action_space=spaces.Tuple((spaces.Discrete(2), spaces.Dict({"run": PLANE, "hop": PLANE}))),

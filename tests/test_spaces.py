@@ -31,8 +31,15 @@ def boxes(draw, min_size=0):
 
 
 @st.composite
+def row_boxes(draw, n_rows):
+    like = draw(boxes(min_size=1))
+    low, high = (np.stack([bound] * n_rows).reshape(n_rows, -1) for bound in (like.low, like.high))
+    return spaces.Box(low, high, dtype=like.dtype)
+
+
+@st.composite
 def hybrid_spaces(draw):
-    layout = draw(st.sampled_from(["nested", "flat", "shared", "dict_nested", "dict_flat", "one_of", "product"]))
+    layout = draw(st.sampled_from(["nested", "flat", "shared", "dict_nested", "dict_flat", "rows", "one_of", "product"]))
     n_actions = draw(st.integers(1, 4))
     discrete = spaces.Discrete(n_actions, start=draw(st.integers(-3, 3)))
     # At least one action has a parameter
@@ -47,6 +54,8 @@ def hybrid_spaces(draw):
         return spaces.Dict({"which": discrete, "how": spaces.Dict({f"p{i}": option for i, option in enumerate(options)})})
     if layout == "dict_flat":
         return spaces.Dict({"which": discrete, **{f"p{i}": option for i, option in enumerate(options)}})
+    if layout == "rows":
+        return spaces.Tuple((discrete, draw(row_boxes(n_actions))))
     if layout == "one_of":
         parts = [
             [],
@@ -68,6 +77,8 @@ def executed_boxes(space, is_shared, k, native):
         rest = [(key, child) for key, child in children_of(space) or [] if not isinstance(child, spaces.Discrete)]
         options: list[tuple[tuple, Any]] = [((key,), child) for key, child in rest]
         nested = children_of(rest[0][1]) if len(rest) == 1 else None
+        if len(rest) == 1 and isinstance(array := rest[0][1], spaces.Box) and len(array.shape) > 1:
+            return [((rest[0][0], k), spaces.Box(array.low[k], array.high[k], dtype=array.dtype))]
         if nested is not None:
             options = [((rest[0][0], key), child) for key, child in nested]
         path, option = options[k]
@@ -129,6 +140,23 @@ def test_tables():
     assert spec.parameter_index.tolist() == [[0, 1], [2, 0], [0, 0]]
     k, parameters = spec.to_native([1, 0.5, 0.9])
     assert k == 1 and parameters[1] == pytest.approx(3.75)
+
+
+def test_rows_of_a_box_belong_to_one_action_each():
+    low, high = np.array([[0, 1], [2, 3], [4, 5]], np.float32), np.array([[1, 3], [3, 5], [6, 9]], np.float32)
+    space = spaces.Dict(which=spaces.Discrete(3, start=1), how=spaces.Box(low, high))
+    spec = HybridActionSpec(space)
+    assert (spec.n_discrete_actions, spec.max_parameters, spec.n_parameters) == (3, 2, 6)
+    native = spec.to_native([1, -1, 1])
+    assert native["which"] == 2
+    np.testing.assert_equal(native["how"], np.array([[0.5, 2], [2, 5], [5, 7]], np.float32))
+    assert spec.to_row(native).tolist() == [1, -1, 1]
+    assert HybridActionSpec(space, "shared").max_parameters == 6
+    # A vector serves all actions, unless told otherwise
+    vector = spaces.Tuple((spaces.Discrete(3), spaces.Box(0, 8, (3,), np.int64)))
+    assert HybridActionSpec(vector).max_parameters == 3
+    spec = HybridActionSpec(vector, "per_action")
+    assert spec.max_parameters == 1 and spec.to_native([2, 1.0])[1].tolist() == [4, 4, 8]
 
 
 def test_parts_of_a_one_of_may_have_discrete_values():

@@ -80,6 +80,10 @@ def replace_part(action: Any, path: Path, value: Any) -> Any:
     if not path:
         return value
     key, rest = path[0], path[1:]
+    if isinstance(action, np.ndarray):
+        array = action.copy()
+        array[key] = replace_part(action[key], rest, value)
+        return array
     container: Any = dict(action) if isinstance(action, dict) else list(action)
     container[key] = replace_part(action[key], rest, value)
     return container if isinstance(action, dict) else tuple(container)
@@ -96,10 +100,17 @@ def digits_of(space: spaces.Space[Any]) -> tuple[tuple[int, ...], np.ndarray]:
     return (2,) * size, np.zeros(size, dtype=np.int64)
 
 
-def find_options(space: spaces.Space[Any]) -> tuple[Path, list[tuple[Path, spaces.Space[Any]]]] | None:
-    """
-    Look for a ``Discrete(K)`` next to K parameter spaces, flat or gathered in one container.
+def rows_of(box: spaces.Box) -> list[tuple[int, spaces.Space[Any]]]:
+    """:return: (index, row) of an array"""
+    return [(i, spaces.Box(box.low[i], box.high[i], box.shape[1:], box.dtype.type)) for i in range(box.shape[0])]
 
+
+def find_options(space: spaces.Space[Any], vectors: bool = False) -> tuple[Path, list[tuple[Path, spaces.Space[Any]]]] | None:
+    """
+    Look for a ``Discrete(K)`` next to K parameter spaces, flat, gathered in one container or as the rows of one ``Box``.
+
+    :param space: an action space
+    :param vectors: whether numbers of a vector are such rows too
     :return: path of the discrete leaf and (path, space) of the K options, None if there is no such reading
     """
     children = children_of(space) or []
@@ -110,6 +121,9 @@ def find_options(space: spaces.Space[Any]) -> tuple[Path, list[tuple[Path, space
         candidates = [rest]
         if len(rest) == 1 and (inner := children_of(rest[0][1])) is not None:
             candidates.insert(0, [((*rest[0][0], name), part) for name, part in inner])
+        if len(rest) == 1 and isinstance(array := rest[0][1], spaces.Box) and len(array.shape) >= (1 if vectors else 2):
+            if array.shape[0] == child.n:
+                candidates.append([((*rest[0][0], i), row) for i, row in rows_of(array)])
         for options in candidates:
             if len(options) == child.n and all(is_parameter_space(part) for _, part in options):
                 return (key,), options

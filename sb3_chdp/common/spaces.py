@@ -44,15 +44,16 @@ class HybridActionSpec:
     mapping is the sorted order of its keys), parameters at any nesting depth:
 
     * one box per action: ``Tuple(Discrete(K), Tuple(Box_1, ..., Box_K))``, ``Tuple(Discrete(K), Box_1, ..., Box_K)``,
-      ``OneOf((Box_1, ..., Box_K))``. An action without parameters is an empty ``Box``, ``Tuple`` or ``Dict``, or
+      ``Tuple(Discrete(K), Box)`` with a ``Box`` of K rows, ``OneOf((Box_1, ..., Box_K))``. An action without parameters is an empty ``Box``, ``Tuple`` or ``Dict``, or
       ``Discrete(1)``. A part of a ``OneOf`` may have discrete leaves, of which every combination is an action;
     * parameters shared by all actions: ``Tuple(Discrete(K), Box)``, and every product of several ``Discrete``,
       ``MultiDiscrete`` or ``MultiBinary`` leaves with ``Box`` leaves. Up to 64 combinations the discrete leaves form one
       joint index (mixed radix, first leaf most significant). Beyond that the space is factored: every digit of a leaf is a
       choice of its own, and k has a column for each. ``layout="joint"`` and ``layout="factored"`` override the rule.
 
-    A space with one ``Discrete(K)`` at the top and exactly K further parts can be read both ways. Rule: it is one box
-    per action; ``layout="shared"`` overrides it.
+    A space with one ``Discrete(K)`` at the top and exactly K further parts, or one ``Box`` of shape (K, d, ...), can be read
+    both ways. Rule: it is one box per action; ``layout="shared"`` overrides it. A ``Box`` of shape (K,) is shared by all actions;
+    ``layout="per_action"`` overrides that.
 
     :param space: the native action space
     :param layout: "auto" (the rules above), "per_action", "shared", "joint" (shared, one index) or "factored" (shared)
@@ -81,7 +82,7 @@ class HybridActionSpec:
         if self._one_of is not None:
             choice = (0,), [((1, k), part) for k, part in enumerate(parts)]
         elif layout in ("auto", "per_action"):
-            choice = find_options(space)
+            choice = find_options(space, vectors=layout == "per_action")
         if choice is None and layout == "per_action":
             raise ValueError(
                 f"action_layout='per_action' needs a Discrete(K) and exactly K parameter spaces at the top, got {space}"
