@@ -287,7 +287,11 @@ class _Player:
         )
 
     def layout_oddity(self) -> str | None:
-        """:return: what is wrong with how the action space was read, by runs in which only parameters of other actions differ"""
+        """
+        Compare runs in which only parameters of other actions than the chosen ones differ.
+
+        :return: what is wrong with how the action space was read
+        """
         spec = self.spec
         if spec.is_shared:
             if spec.layout != "auto" or find_options(spec.space, vectors=True) is None:
@@ -304,8 +308,8 @@ class _Player:
         # Where no parameter has an effect nothing is to be said
         if self.spec.is_shared and not have_effect and not data_equivalence(low, self._run(self.spec)):
             return (
-                f"Only one number of the Box seems to have an effect, {spec.names_of(0)} with action 0, {spec.names_of(1)} with "
-                "action 1, and so on: give the algorithm, and this function, action_layout='per_action'"
+                f"Only one number of the Box seems to have an effect, {spec.names_of(0)} with action 0, {spec.names_of(1)} "
+                "with action 1, and so on: give the algorithm, and this function, action_layout='per_action'"
             )
         return None
 

@@ -224,8 +224,8 @@ WARNINGS = {
         lambda: walk(
             action_space=spaces.Tuple((spaces.Discrete(2), PLANE)), reward=lambda self, action: float(action[1][action[0]])
         ),
-        "action_space[1][0] with action 0, action_space[1][1] with action 1, and so on: give the algorithm, and this function, "
-        "action_layout='per_action'",
+        "action_space[1][0] with action 0, action_space[1][1] with action 1, and so on: give the algorithm, and this "
+        "function, action_layout='per_action'",
     ),
     "rows_for_all": (
         lambda: walk(

@@ -44,16 +44,17 @@ class HybridActionSpec:
     mapping is the sorted order of its keys), parameters at any nesting depth:
 
     * one box per action: ``Tuple(Discrete(K), Tuple(Box_1, ..., Box_K))``, ``Tuple(Discrete(K), Box_1, ..., Box_K)``,
-      ``Tuple(Discrete(K), Box)`` with a ``Box`` of K rows, ``OneOf((Box_1, ..., Box_K))``. An action without parameters is an empty ``Box``, ``Tuple`` or ``Dict``, or
-      ``Discrete(1)``. A part of a ``OneOf`` may have discrete leaves, of which every combination is an action;
+      ``Tuple(Discrete(K), Box)`` with a ``Box`` of K rows, ``OneOf((Box_1, ..., Box_K))``. An action without parameters is an
+      empty ``Box``, ``Tuple`` or ``Dict``, or ``Discrete(1)``. A part of a ``OneOf`` may have discrete leaves, of which every
+      combination is an action;
     * parameters shared by all actions: ``Tuple(Discrete(K), Box)``, and every product of several ``Discrete``,
       ``MultiDiscrete`` or ``MultiBinary`` leaves with ``Box`` leaves. Up to 64 combinations the discrete leaves form one
       joint index (mixed radix, first leaf most significant). Beyond that the space is factored: every digit of a leaf is a
       choice of its own, and k has a column for each. ``layout="joint"`` and ``layout="factored"`` override the rule.
 
     A space with one ``Discrete(K)`` at the top and exactly K further parts, or one ``Box`` of shape (K, d, ...), can be read
-    both ways. Rule: it is one box per action; ``layout="shared"`` overrides it. A ``Box`` of shape (K,) is shared by all actions;
-    ``layout="per_action"`` overrides that.
+    both ways. Rule: it is one box per action; ``layout="shared"`` overrides it. A ``Box`` of shape (K,) is shared by all
+    actions; ``layout="per_action"`` overrides that.
 
     :param space: the native action space
     :param layout: "auto" (the rules above), "per_action", "shared", "joint" (shared, one index) or "factored" (shared)
