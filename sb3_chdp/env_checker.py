@@ -299,19 +299,21 @@ class _Player:
             spec = HybridActionSpec(spec.space, "per_action")
         low, high = (self._run(spec.leaving_others_at(place)) for place in (-1, 1))
         have_effect = not data_equivalence(low, high)
-        if have_effect and not self.spec.is_shared:
-            return (
-                "Parameters of other actions than the chosen one have an effect. If every action has all of them, give the "
-                "algorithm, and this function, action_layout='shared'. Else put them in the order of the actions: action 0 "
-                f"has {spec.names_of(0)}, action 1 {spec.names_of(1)}, and so on; a Dict made of a plain dict sorts its keys"
-            )
-        # Where no parameter has an effect nothing is to be said
-        if self.spec.is_shared and not have_effect and not data_equivalence(low, self._run(self.spec)):
+        if self.spec.is_shared:
+            # Where no parameter at all has an effect there is nothing to say
+            if have_effect or data_equivalence(low, self._run(self.spec)):
+                return None
             return (
                 f"Only one number of the Box seems to have an effect, {spec.names_of(0)} with action 0, {spec.names_of(1)} "
                 "with action 1, and so on: give the algorithm, and this function, action_layout='per_action'"
             )
-        return None
+        if not have_effect:
+            return None
+        return (
+            "Parameters of other actions than the chosen one have an effect. If every action has all of them, give the "
+            "algorithm, and this function, action_layout='shared'. Else put them in the order of the actions: action 0 has "
+            f"{spec.names_of(0)}, action 1 {spec.names_of(1)}, and so on; a Dict made of a plain dict sorts its keys"
+        )
 
     def _run(self, spec: HybridActionSpec) -> list[Any]:
         """:return: what comes of random actions after ``reset(seed=1)``, made native by this codec"""

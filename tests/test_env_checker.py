@@ -312,6 +312,23 @@ def test_warnings(mistake):
         check_hybrid_env(make(), warn=False)
 
 
+@pytest.mark.parametrize("action_layout", ["auto", "per_action", "shared"])
+@pytest.mark.parametrize("numbers", ["none", "own", "all"])
+def test_numbers_of_a_vector(numbers, action_layout):
+    """There is a hint where the vector was read in the wrong way, and nowhere else."""
+    rewards = {
+        "none": lambda self, action: 0.0,
+        "own": lambda self, action: float(action[1][action[0]]),
+        "all": lambda self, action: float(action[1].sum()),
+    }
+    env = walk(action_space=spaces.Tuple((spaces.Discrete(2), PLANE)), reward=rewards[numbers])
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        check_hybrid_env(env, action_layout)
+    hints = [str(warning.message) for warning in said if "action_layout=" in str(warning.message)]
+    assert len(hints) == ((numbers, action_layout) in {("own", "auto"), ("all", "per_action")}), hints
+
+
 @pytest.mark.parametrize("layout", layouts())
 def test_every_layout_passes(layout):
     check_hybrid_env(LayoutEnv(layouts()[layout]), warn=False)

@@ -68,6 +68,7 @@ class HybridActionSpec:
         self.space = space
         self.layout = layout
         self._one_of: OneOfChoices | None = None
+        choice: tuple[Path, list[tuple[Path, spaces.Space[Any]]]] | None = None
         if isinstance(space, spaces.OneOf):
             if layout not in ("auto", "per_action"):
                 raise ValueError(f"action_layout={layout!r} does not apply to a OneOf space, whose parts exclude each other")
@@ -75,18 +76,17 @@ class HybridActionSpec:
             # Read as one box per action; of its native actions only the chosen part is handed out
             parts = [space.spaces[i] for i in self._one_of.parts]
             space = spaces.Tuple((spaces.Discrete(len(parts)), spaces.Tuple(parts)))
+            choice = (0,), [((1, k), part) for k, part in enumerate(parts)]
         elif not isinstance(space, (spaces.Tuple, spaces.Dict)):
             raise ValueError(
                 f"The action space must be a Tuple, Dict or OneOf with a discrete and a continuous part, got {space}"
             )
-        choice: tuple[Path, list[tuple[Path, spaces.Space[Any]]]] | None = None
-        if self._one_of is not None:
-            choice = (0,), [((1, k), part) for k, part in enumerate(parts)]
         elif layout in ("auto", "per_action"):
             choice = find_options(space, vectors=layout == "per_action")
         if choice is None and layout == "per_action":
             raise ValueError(
-                f"action_layout='per_action' needs a Discrete(K) and exactly K parameter spaces at the top, got {space}"
+                "action_layout='per_action' needs at the top a Discrete(K) and exactly K parameter spaces, or one Box with K "
+                f"rows, got {space}"
             )
         self.is_shared = choice is None
         if choice is None:
