@@ -56,7 +56,7 @@ class UnplacedPolicy(CHDPPolicy):
 class UnreadingPolicy(CHDPPolicy):
     """Actions do not say what is read of the state."""
 
-    n_reads: ClassVar[int] = 0
+    n_reads = 0
 
 
 class WideLatentsPolicy(CHDPPolicy):

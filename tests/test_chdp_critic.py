@@ -1,12 +1,17 @@
 """What the critics of CHDP see, and what they can fit for it."""
 
+import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 
+from sb3_chdp import CHDP
 from sb3_chdp.chdp.codebook import Codebook
 from sb3_chdp.chdp.critic import AttentionReads, QNetwork
 from sb3_chdp.chdp.product_codebook import ProductCodebook
+from tests.algorithms import make_model
 from tests.fitting import unexplained
+from tests.hybrid_envs import box, make_layout_env
 
 N_FEATURES, LATENT_DIM = 6, 32
 
@@ -52,6 +57,17 @@ def test_reads_find_what_an_action_is_about():
 
         left.append(unexplained(q_network, batch, 400))
     assert left[1] < 0.2 * left[0]
+
+
+@pytest.mark.parametrize(
+    "policy, space, reads",
+    [("MlpPolicy", box(-1, 1, 3), True), ("CnnPolicy", spaces.Box(0, 255, (36, 36, 1), np.uint8), False)],
+)
+def test_only_entries_of_observations_are_read(policy, space, reads):
+    """What a convolutional network puts out is learnt, and there is much of it."""
+    model = make_model(CHDP, make_layout_env(observation_space=space), policy)
+    for network in (model.actor, *model.critic.q_networks, model.critic.reward_network):
+        assert any(isinstance(module, AttentionReads) for module in network.modules()) == reads
 
 
 def test_values_drop_where_an_entry_passes_a_threshold():

@@ -79,7 +79,7 @@ class QNetwork(nn.Module):
     :param n_parameters: number of parameters
     :param net_arch: hidden layers of A; V has one of half the width of the first
     :param activation_fn: activation function
-    :param n_reads: number of reads
+    :param n_reads: number of reads, 0: none
     """
 
     latent_scale: th.Tensor
@@ -97,7 +97,7 @@ class QNetwork(nn.Module):
         super().__init__()
         self.features_dim, self.n_bins, latent_dim = features_dim, n_bins_of(n_positions), len(latent_widths)
         self.register_buffer("latent_scale", (LATENT_NORM / latent_widths.sqrt()).clamp(max=1), persistent=False)
-        self.reads = AttentionReads(features_dim, latent_dim, n_reads)
+        self.reads = AttentionReads(features_dim, latent_dim, n_reads) if n_reads else None
         value_arch = [width // 2 for width in net_arch[:1]]
         self.value = value_mlp(features_dim + self.n_bins * n_positions, value_arch, activation_fn)
         n_inputs = features_dim + n_parameters + latent_dim + n_reads + latent_dim * n_parameters
@@ -110,9 +110,10 @@ class QNetwork(nn.Module):
         n = latents.shape[0] // features.shape[0]
         if n > 1:
             features, values = features.repeat_interleave(n, dim=0), values.repeat_interleave(n, dim=0)
-        reads, latents = self.reads(features, latents), self.latent_scale * latents
+        reads = [] if self.reads is None else [self.reads(features, latents)]
+        latents = self.latent_scale * latents
         products = (latents[:, :, None] * parameters[:, None]).flatten(1)
-        return values + self.advantage(th.cat([features, parameters, latents, reads, products], dim=1))
+        return values + self.advantage(th.cat([features, parameters, latents, *reads, products], dim=1))
 
     @th.no_grad()
     def rescale(self, factor: th.Tensor, summand: th.Tensor) -> None:

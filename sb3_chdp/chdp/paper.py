@@ -82,7 +82,7 @@ class PaperPolicy(CHDPPolicy):
     actor_class: ClassVar[type[CooperativeActor]] = PaperActor
     adapts_values: ClassVar[bool] = False
     random_share: ClassVar[float] = 0.0
-    n_reads: ClassVar[int] = 0
+    n_reads = 0
 
     def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **{"features_extractor_class": FlattenExtractor, **kwargs})

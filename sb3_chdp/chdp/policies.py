@@ -67,8 +67,8 @@ class CHDPPolicy(HybridPolicy):
     # Weight of a random action in the values of next states. Where only the best action avoids a failure, values jump, and
     # critics, which are smooth, overshoot: policies would go there
     random_share: ClassVar[float] = 0.1
-    # What critics and continuous policy read of the features, see AttentionReads
-    n_reads: ClassVar[int] = 8
+    # What critics and continuous policy read of the features, see AttentionReads; none of features that are learnt
+    n_reads: int = 8
 
     def __init__(
         self,
@@ -107,13 +107,15 @@ class CHDPPolicy(HybridPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         extractor, codebook = self.make_features_extractor(), self._make_codebook()
+        self.learns_features = any(True for _ in extractor.parameters())
+        if self.learns_features:
+            self.n_reads = 0
         self.critic = self._make_critic(extractor, codebook)
         self.actor = self._make_actor(extractor.features_dim, codebook)
         self.actor_target, self.critic_target = deepcopy(self.actor), deepcopy(self.critic)
         for target in (self.actor_target, self.critic_target):
             target.requires_grad_(False)
             target.train(False)
-        self.learns_features = any(True for _ in extractor.parameters())
         self.value_scale = ValueScale(self.adapts_values)
         self.select, self.select_deterministic, self.select_target = self._make_selections()
 
