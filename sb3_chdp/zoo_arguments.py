@@ -1,6 +1,5 @@
 """Arguments of the command line: what users need not say, and hints about what they said."""
 
-import builtins
 import difflib
 import importlib
 from collections.abc import Iterable
@@ -98,13 +97,19 @@ def check_hyperparams(arguments: list[str]) -> None:
     :param arguments: command line
     :raises ArgumentsError: for a setting that is not ``KEY:VALUE`` with a value of Python's
     """
+    from rl_zoo3 import utils
+
     names = ("-params", "--hyperparams")
     for setting in [setting for name in names for setting in split_option(arguments, name)[1]]:
         key, _, value = setting.partition(":")
         if not value:
             raise ArgumentsError(f"-params {setting}: write KEY:VALUE, for example gamma:0.9")
-        if value.isidentifier() and value not in vars(builtins):
-            raise ArgumentsError(f"-params {setting}: texts need quotes, -params \"{key}:'{value}'\"")
+        try:
+            eval(value, dict(vars(utils)))  # as rl_zoo3 does
+        except (SyntaxError, NameError):
+            raise ArgumentsError(
+                f"-params {setting}: no value of Python's; texts need quotes, -params \"{key}:'{value}'\""
+            ) from None
 
 
 def check_env(env_id: str | None) -> None:

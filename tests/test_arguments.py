@@ -178,6 +178,12 @@ def test_arguments_of_the_algorithm_in_policy_kwargs(algorithm, name, value):
         make_model(algorithm, make_layout_env(), policy_kwargs={name: value})
 
 
+@pytest.mark.parametrize("name", ["use_sde", "squash_output"])
+def test_arguments_that_policies_set_themselves(algorithm, name):
+    with pytest.raises(ValueError, match=rf"policy_kwargs has unknown key\(s\) \['{name}'\]"):
+        make_model(algorithm, make_layout_env(), policy_kwargs={name: True})
+
+
 OTHERS: dict[str, dict[str, Any]] = {
     "class": dict(replay_buffer_class=NStepReplayBuffer, replay_buffer_kwargs=dict(n_steps=2, gamma=0.9)),
     "observation_space": dict(env=make_layout_env(observation_space=box(-2, 2, 2))),
@@ -206,6 +212,9 @@ def test_n_step_buffers_discount_as_the_algorithm_does(off_policy_algorithm):
     assert make_model(off_policy_algorithm, make_layout_env(), **kwargs).replay_buffer.gamma == 0.7
     with pytest.raises(ValueError, match="replay_buffer_kwargs must be a dict, or None, got 5"):
         make_model(off_policy_algorithm, make_layout_env(), replay_buffer_kwargs=5)
+    kwargs = dict(replay_buffer_class=NStepReplayBuffer, replay_buffer_kwargs=dict(n_steps=0))
+    with pytest.raises(ValueError, match="n_steps must be a whole number of at least 1, got 0"):
+        make_model(off_policy_algorithm, make_layout_env(), **kwargs)
 
 
 def test_replay_buffers_of_other_returns(off_policy_algorithm, tmp_path):

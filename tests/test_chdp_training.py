@@ -168,6 +168,15 @@ def test_usage_is_of_what_the_discrete_policy_draws():
     assert logged["train/codebook_usage"] == 0.25 and logged["train/codebook_perplexity"] == pytest.approx(1)
 
 
+def test_leaves_of_long_names_do_not_stop_what_is_printed(capsys):
+    """SB3 refuses to print keys that are the same where it cuts them."""
+    leaves = {f"valve_position_{side}": spaces.MultiBinary(6) for side in ("left", "right")}
+    model = filled_model(LayoutEnv(spaces.Dict(**leaves, flow=box(-1, 1, 1))), verbose=1)
+    model.train(1, 32)
+    model.logger.dump()
+    assert "codebook_perplexity" in capsys.readouterr().out
+
+
 def test_usage_of_every_leaf_is_logged():
     env = LayoutEnv(spaces.Dict(units=spaces.MultiBinary(6), mode=spaces.Discrete(32), set=box(-1, 1, 1)))
     model = filled_model(env)

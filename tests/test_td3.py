@@ -10,6 +10,7 @@ from stable_baselines3 import TD3
 from sb3_chdp import HHQNTD3, PATD3, PDQNTD3, FlattenHybridAction
 from sb3_chdp.common.buffers import PrioritizedReplayBuffer
 from sb3_chdp.common.td3 import InvertingGradients
+from sb3_chdp.common.watkins_buffer import WatkinsReplayBuffer
 from tests.algorithms import make_model
 from tests.hybrid_envs import make_layout_env
 
@@ -92,6 +93,7 @@ def test_exploration_noise_reaches_scores_and_parameters():
 
 
 @pytest.mark.parametrize("algorithm", [PATD3, PDQNTD3])
-def test_priorities_that_nobody_would_set_are_refused(algorithm):
-    with pytest.raises(ValueError, match="replay_buffer_class must be a class of replay buffers without priorities"):
-        make_model(algorithm, make_layout_env(), replay_buffer_class=PrioritizedReplayBuffer)
+@pytest.mark.parametrize("buffer_class", [PrioritizedReplayBuffer, WatkinsReplayBuffer])
+def test_priorities_and_costs_that_nobody_would_set_are_refused(algorithm, buffer_class):
+    with pytest.raises(ValueError, match="replay_buffer_class must be a class of replay buffers without priorities or costs"):
+        make_model(algorithm, make_layout_env(), replay_buffer_class=buffer_class)

@@ -96,6 +96,9 @@ def test_algorithm(command, arguments, prepared):
     [
         ("-params gamma=0.9", "-params gamma=0.9: write KEY:VALUE, for example gamma:0.9"),
         ("-params gamma:1 action_layout:shared", "texts need quotes, -params \"action_layout:'shared'\""),
+        ("-params learning_rate:lin_0.001", "texts need quotes, -params \"learning_rate:'lin_0.001'\""),
+        ("-params learning_rate:lin_1e-3", "texts need quotes, -params \"learning_rate:'lin_1e-3'\""),
+        ("-params policy_kwargs:dict(net_arch=[64", "no value of Python's"),
         ("--algo sb3:chdp", "sb3:chdp: chdp is of this package, leave out sb3:"),
         ("--algo=sb3:hppo", "sb3:hppo: hppo is of this package, leave out sb3:"),
         ("-conf nowhere.yml", "-conf: there is no file nowhere.yml"),

@@ -82,7 +82,8 @@ class CHDP(ExploringAlgorithm):
     :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation.
     :param optimize_memory_usage: Enable a memory efficient variant of the replay buffer at a cost of more complexity.
     :param n_steps: When n_step > 1, uses n-step return (with the NStepReplayBuffer) when updating the critics. By default n
-        depends on the task, see :class:`WatkinsReplayBuffer`; with ``replay_buffer_class=ReplayBuffer`` it is 1
+        depends on the task, see :class:`WatkinsReplayBuffer`; it is 1 with ``replay_buffer_class=ReplayBuffer`` or
+        ``optimize_memory_usage=True``
     :param latent_dim: width d_e of the latent and of a codeword, at most that of one choice of a factored space
     :param n_diffusion_steps: number N of denoising steps of both policies
     :param eta: weight of the policy improvement terms relative to the diffusion losses
@@ -291,7 +292,8 @@ class CHDP(ExploringAlgorithm):
         for name, values in zip(("usage", "perplexity"), self.actor.codebook.usage(k), strict=True):
             self.logger.record(f"train/codebook_{name}", values.mean().item())
             for leaf, choices in leaves.items() if len(leaves) > 1 else ():
-                self.logger.record(f"train/codebook_{name}/{leaf}", values[choices].mean().item())
+                # SB3 cuts long keys where it prints them, and refuses those that are then the same
+                self.logger.record(f"train/codebook_{name}/{leaf}", values[choices].mean().item(), exclude="stdout")
 
     def _sample_batch(self, batch_size: int) -> HybridReplaySamples:
         replay_data = super()._sample_batch(batch_size)

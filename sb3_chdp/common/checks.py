@@ -158,13 +158,20 @@ def check_keys(space: spaces.Space[Any]) -> None:
             raise ValueError(f"observation_space has the key {key!r}, which PyTorch takes for no name: rename it") from error
 
 
+# What the algorithm gives to its policy, what the policy sets itself, and gSDE, which no algorithm has
+NO_POLICY_KWARGS = {
+    *("observation_space", "action_space", "lr_schedule", "squash_output"),
+    *("use_sde", "full_std", "use_expln"),
+}
+
+
 def check_policy_kwargs(policy_class: type, policy_kwargs: dict[str, Any]) -> None:
     """
     :raises ValueError: if the policy has no such argument, where the message lists those it has, and for the name of a class
     """
     if not isinstance(policy_kwargs, dict):
         raise ValueError(f"policy_kwargs must be a dict, or None, got {policy_kwargs!r}")
-    accepted = {*constructor_defaults(policy_class)} - {"observation_space", "action_space", "lr_schedule", "self"}
+    accepted = {*constructor_defaults(policy_class)} - NO_POLICY_KWARGS
     unknown = set(policy_kwargs) - accepted
     if unknown:
         raise ValueError(

@@ -8,7 +8,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_chdp.common.arguments import Accepted, constructor_defaults, is_class_of
+from sb3_chdp.common.arguments import Accepted, check, constructor_defaults, is_class_of, whole
 from sb3_chdp.common.hybrid_box import HybridBox
 
 
@@ -78,4 +78,5 @@ def n_step_settings(
         of_algorithm = {"gamma": gamma, **({"n_steps": n_steps} if n_steps > 1 else {})}
         taken = constructor_defaults(kind)
         kwargs = {**{name: value for name, value in of_algorithm.items() if name in taken}, **kwargs}
+        check(whole(1), n_steps=kwargs.get("n_steps", n_steps))
     return kind, dict(kwargs)

@@ -21,6 +21,7 @@ from sb3_chdp.common.off_policy_algorithm import HybridOffPolicyAlgorithm
 from sb3_chdp.common.policies import HybridPolicy
 from sb3_chdp.common.samples import HybridReplaySamples
 from sb3_chdp.common.utils import default_optimizer_kwargs, gradient_step
+from sb3_chdp.common.watkins_buffer import WatkinsReplayBuffer
 
 
 class _InvertGradient(th.autograd.Function):
@@ -153,8 +154,9 @@ class HybridTD3(HybridOffPolicyAlgorithm):
     accepted_arguments: ClassVar[dict[str, Accepted]] = {
         "replay_buffer_class": optional(
             Accepted(
-                "a class of replay buffers without priorities, which only CHDP sets",
-                lambda kind: is_class_of(kind, ReplayBuffer) and not issubclass(kind, PrioritizedReplayBuffer),
+                "a class of replay buffers without priorities or costs, which only CHDP sets",
+                lambda kind: is_class_of(kind, ReplayBuffer)
+                and not issubclass(kind, (PrioritizedReplayBuffer, WatkinsReplayBuffer)),
             )
         ),
         "target_policy_noise": NOT_NEGATIVE,

@@ -24,9 +24,9 @@ ENEMY_SPEED = 30.0
 SPEED_NOISE = 0.5 * DT
 # Where the player stands on a platform, clear of its enemy's place at the start
 STARTS = ((0.0, 210.0), (455.0, 710.0), (965.0, 1034.0))
-TAKE_OFF_SPEED = (0.0, 35.0, 25.0)  # run, hop, leap
+RUN = 0  # of run, hop, leap
+TAKE_OFF_SPEED = (0.0, 35.0, 25.0)
 RUN_FRAMES = 20
-RUN, HOP, LEAP = 0, 1, 2
 PARAMETER_BOUNDS = ((0.0, 30.0), (0.0, 720.0), (0.0, 430.0))
 
 # (w1, w2, gap, left edge) of the platform that the observation calls current, already scaled to [-1, 1]

@@ -40,7 +40,6 @@ class ParameterActor(Actor):
     ):
         super().__init__(*args, **kwargs)
         n_parameters = get_action_dim(self.action_space)
-        self.inverting_gradients = inverting_gradients
         self.mu = nn.Sequential(*create_mlp(self.features_dim, n_parameters, self.net_arch, self.activation_fn))
         self.squash = InvertingGradients() if inverting_gradients else nn.Tanh()
         shapes = {"weight": (n_parameters, self.features_dim), "bias": (n_parameters,)}
