@@ -16,8 +16,8 @@ class FlattenHybridAction(gym.ActionWrapper[np.ndarray, np.ndarray, Any], gym.ut
     Let SB3's own algorithms (SAC, TD3, PPO, ...) run on an environment with hybrid actions.
 
     The action is a vector in [-1, 1]^(K + P): a score for every discrete action, of which the highest is taken, in a factored
-    space for every value of each choice, followed by the scaled parameters of all actions one after the other (PADDPG, Hausknecht
-    and Stone, 2016). If the environment has ``action_masks()``, the highest score of an allowed action counts.
+    space for every value of each choice, followed by the scaled parameters of all actions one after the other (PADDPG,
+    Hausknecht and Stone, 2016). If the environment has ``action_masks()``, the highest score of an allowed action counts.
 
     :param env: environment with a hybrid action space
     :param action_layout: see :class:`HybridActionSpec`

@@ -1,6 +1,7 @@
 """The training of CHDP as a whole: what is updated when, from which batches, and what is logged."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -170,8 +171,8 @@ def test_usage_is_of_what_the_discrete_policy_draws():
 
 def test_leaves_of_long_names_do_not_stop_what_is_printed(capsys):
     """SB3 refuses to print keys that are the same where it cuts them."""
-    leaves = {f"valve_position_{side}": spaces.MultiBinary(6) for side in ("left", "right")}
-    model = filled_model(LayoutEnv(spaces.Dict(**leaves, flow=box(-1, 1, 1))), verbose=1)
+    leaves: dict[str, Any] = {f"valve_position_{side}": spaces.MultiBinary(6) for side in ("left", "right")}
+    model = filled_model(LayoutEnv(spaces.Dict({**leaves, "flow": box(-1, 1, 1)})), verbose=1)
     model.train(1, 32)
     model.logger.dump()
     assert "codebook_perplexity" in capsys.readouterr().out
