@@ -213,3 +213,42 @@ class GoalEnv(LayoutEnv):
     def step(self, action):
         obs, _, *rest = super().step(action)
         return obs, float(self.compute_reward(obs["achieved_goal"], obs["desired_goal"], {})), *rest
+
+
+class Walk(gym.Env):
+    """A walk at random with nothing wrong; see :func:`walk`."""
+
+    action_space, observation_space = layouts()["shared"], box(-1, 1, 2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.observation(), {}
+
+    def observation(self):
+        return self.np_random.uniform(-1, 1, 2).astype(np.float32)
+
+    def step(self, action):
+        self.t += 1
+        return self.observation(), self.reward(action), self.terminated(), self.truncated(), self.info()
+
+    def reward(self, action):
+        return 0.5
+
+    def terminated(self):
+        return bool(self.np_random.uniform() < 0.1)
+
+    def truncated(self):
+        return self.t >= 20
+
+    def info(self):
+        return {}
+
+
+def walk(**changes):
+    """:return: the walk, in which functions are methods and all else is returned in place of what a method returns"""
+    methods = {
+        name: change if callable(change) or name.endswith("space") else lambda self, *_, value=change: value
+        for name, change in changes.items()
+    }
+    return type("Walk", (Walk,), methods)()

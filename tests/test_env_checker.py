@@ -1,7 +1,6 @@
 """The mistakes that users make in their environments, and what they are told to do about each."""
 
 import warnings
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -10,49 +9,9 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_chdp import CHDP, ScalarBoxes, check_hybrid_env
-from tests.hybrid_envs import GoalEnv, LayoutEnv, MaskedEnv, box, layouts
+from tests.hybrid_envs import GoalEnv, LayoutEnv, MaskedEnv, Walk, box, layouts, walk
 
-ACTIONS: Any = layouts()["shared"]
 PLANE = box(-1, 1, 2)
-
-
-class Walk(gym.Env):
-    """Nothing is wrong with it; each mistake changes one thing."""
-
-    action_space, observation_space = ACTIONS, PLANE
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return self.observation(), {}
-
-    def observation(self):
-        return self.np_random.uniform(-1, 1, 2).astype(np.float32)
-
-    def step(self, action):
-        self.t += 1
-        return self.observation(), self.reward(action), self.terminated(), self.truncated(), self.info()
-
-    def reward(self, action):
-        return 0.5
-
-    def terminated(self):
-        return bool(self.np_random.uniform() < 0.1)
-
-    def truncated(self):
-        return self.t >= 20
-
-    def info(self):
-        return {}
-
-
-def walk(**changes):
-    """:return: the walk, in which functions are methods and all else is returned in place of what a method returns"""
-    methods = {
-        name: change if callable(change) or name.endswith("space") else lambda self, *_, value=change: value
-        for name, change in changes.items()
-    }
-    return type("Walk", (Walk,), methods)()
 
 
 def observing(space, value=None):
@@ -201,7 +160,9 @@ ERRORS = {
     ),
     "a_name": (lambda: "Goal-v0", "env is a name: give the environment, gymnasium.make('Goal-v0')"),
     "own_contains": (
-        lambda: walk(action_space=type("Own", (spaces.Tuple,), {"contains": lambda self, x: False})(ACTIONS.spaces)),
+        lambda: walk(
+            action_space=type("Own", (spaces.Tuple,), {"contains": lambda self, x: False})((spaces.Discrete(3), PLANE))
+        ),
         "but env.action_space.contains() says no",
     ),
 }

@@ -158,11 +158,8 @@ def check_keys(space: spaces.Space[Any]) -> None:
             raise ValueError(f"observation_space has the key {key!r}, which PyTorch takes for no name: rename it") from error
 
 
-# What the algorithm gives to its policy, what the policy sets itself, and gSDE, which no algorithm has
-NO_POLICY_KWARGS = {
-    *("observation_space", "action_space", "lr_schedule", "squash_output"),
-    *("use_sde", "full_std", "use_expln"),
-}
+# Given by the algorithm, set by the policy, or of gSDE, which no algorithm has
+NO_POLICY_KWARGS = {"observation_space", "action_space", "lr_schedule", "squash_output", "use_sde", "full_std", "use_expln"}
 
 
 def check_policy_kwargs(policy_class: type, policy_kwargs: dict[str, Any]) -> None:
